@@ -1,0 +1,1 @@
+"""Clouds, fog and smoke: what the trainer and the renderer must agree on."""

@@ -1,0 +1,333 @@
+// deepclouds.volume._openvdb: what a .vdb file holds, one float grid as a dense array, and a dense array as a .vdb file.
+//
+// Everything that OpenVDB throws reaches Python as VdbError with OpenVDB's own words. The Python side (deepclouds/volume/vdb.py)
+// decides which grids are acceptable; here lies only what needs the C++ library.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+
+#include <openvdb/io/Archive.h>
+#include <openvdb/io/GridDescriptor.h>
+#include <openvdb/math/Maps.h>
+#include <openvdb/openvdb.h>
+#include <openvdb/tools/Dense.h>
+
+#include <cstdint>
+#include <fstream>
+#include <limits>
+#include <map>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+namespace nb = nanobind;
+
+namespace {
+
+struct VdbError : std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
+
+struct Entry {
+    openvdb::io::GridDescriptor descriptor;
+    openvdb::GridBase::Ptr grid;  // empty until read; null for a type that this build of OpenVDB does not know
+};
+
+// Reads a file grid by grid. openvdb::io::File would do, but it neither notices that a file ends too early (it goes on with zeros)
+// nor can it list a file that has one grid of an unknown type. Here the stream itself throws at the end of the file.
+class Reader : public openvdb::io::Archive {
+public:
+    explicit Reader(const std::string& path) : stream_(path, std::ios::binary) {
+        if (!stream_) {
+            throw VdbError("the file cannot be opened");
+        }
+        stream_.seekg(0, std::ios::end);
+        size_ = static_cast<std::int64_t>(stream_.tellg());
+        stream_.seekg(0);
+        stream_.exceptions(std::ios::failbit | std::ios::badbit | std::ios::eofbit);
+        readHeader(stream_);
+        if (!inputHasGridOffsets()) {
+            throw VdbError("the file is a stream without grid offsets; open and save it once with an OpenVDB tool");
+        }
+        setFormatVersion(stream_);
+        setLibraryVersion(stream_);
+        setDataCompression(stream_);
+        openvdb::MetaMap file_metadata;
+        file_metadata.readMeta(stream_);
+        const std::int32_t count = readGridCount(stream_);
+        if (count < 0) {
+            throw VdbError("the file's table of grids is damaged");
+        }
+        for (std::int32_t i = 0; i < count; ++i) {
+            Entry entry;
+            try {
+                entry.grid = entry.descriptor.read(stream_);
+            } catch (const openvdb::LookupError&) {
+                // The type's name is read before the type is looked up; the three offsets that follow it are read here.
+                std::int64_t offsets[3];
+                stream_.read(reinterpret_cast<char*>(offsets), sizeof offsets);
+                entry.descriptor.setGridPos(offsets[0]);
+                entry.descriptor.setBlockPos(offsets[1]);
+                entry.descriptor.setEndPos(offsets[2]);
+            }
+            const auto& d = entry.descriptor;
+            if (d.getGridPos() <= 0 || d.getEndPos() < d.getGridPos() || d.getEndPos() > size_) {
+                throw VdbError("the file ends before its grid '" + d.gridName() + "' does");
+            }
+            entries_.push_back(entry);
+            if (i + 1 < count) {
+                d.seekToEnd(stream_);
+            }
+        }
+    }
+
+    const std::vector<Entry>& entries() const { return entries_; }
+
+    const Entry& at(std::size_t index) const {
+        if (index >= entries_.size()) {
+            throw VdbError("the file has no grid number " + std::to_string(index));
+        }
+        return entries_[index];
+    }
+
+    // The grid with its tree; an instance shares the tree of the grid that it names.
+    openvdb::GridBase::Ptr load(std::size_t index) {
+        const Entry& entry = at(index);
+        const auto& d = entry.descriptor;
+        if (!entry.grid) {
+            throw VdbError("OpenVDB does not know the grid type '" + d.gridType() + "'");
+        }
+        fill(entry);
+        if (d.isInstance()) {
+            for (const Entry& parent : entries_) {
+                if (parent.descriptor.uniqueName() == d.instanceParentName() && parent.grid && !parent.descriptor.isInstance()) {
+                    fill(parent);
+                    entry.grid->setTree(parent.grid->baseTreePtr());
+                    return entry.grid;
+                }
+            }
+            throw VdbError("the grid '" + d.gridName() + "' shares the voxels of '" + d.instanceParentName() + "', which the file lacks");
+        }
+        return entry.grid;
+    }
+
+private:
+    void fill(const Entry& entry) {
+        entry.descriptor.seekToGrid(stream_);
+        readGrid(entry.grid, entry.descriptor, stream_);
+        // What the writer counted is compared with what was read: a file damaged in the middle may still parse.
+        const auto counted = entry.grid->getMetadata<openvdb::Int64Metadata>(openvdb::GridBase::META_FILE_VOXEL_COUNT);
+        if (counted && !entry.descriptor.isInstance()) {
+            const auto found = static_cast<std::int64_t>(entry.grid->activeVoxelCount());
+            if (found != counted->value()) {
+                throw VdbError("the grid '" + entry.descriptor.gridName() + "' should have " + std::to_string(counted->value()) +
+                               " active voxels and has " + std::to_string(found) + ": the file is damaged");
+            }
+        }
+    }
+
+    std::ifstream stream_;
+    std::int64_t size_ = 0;
+    std::vector<Entry> entries_;
+};
+
+nb::object metadata_value(const openvdb::Metadata& metadata) {
+    if (const auto* m = dynamic_cast<const openvdb::StringMetadata*>(&metadata)) {
+        const std::string& text = m->value();
+        PyObject* decoded = PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "replace");
+        return nb::steal(decoded);
+    }
+    if (const auto* m = dynamic_cast<const openvdb::BoolMetadata*>(&metadata)) return nb::cast(m->value());
+    if (const auto* m = dynamic_cast<const openvdb::Int32Metadata*>(&metadata)) return nb::cast(m->value());
+    if (const auto* m = dynamic_cast<const openvdb::Int64Metadata*>(&metadata)) return nb::cast(m->value());
+    if (const auto* m = dynamic_cast<const openvdb::FloatMetadata*>(&metadata)) return nb::cast(m->value());
+    if (const auto* m = dynamic_cast<const openvdb::DoubleMetadata*>(&metadata)) return nb::cast(m->value());
+    const std::string text = metadata.str();
+    return nb::steal(PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "replace"));
+}
+
+nb::str text(const std::string& bytes) {
+    return nb::steal<nb::str>(PyUnicode_DecodeUTF8(bytes.data(), static_cast<Py_ssize_t>(bytes.size()), "replace"));
+}
+
+nb::dict header(const Entry& entry) {
+    nb::dict out;
+    out["name"] = text(entry.descriptor.gridName());
+    out["unique_name"] = text(openvdb::io::GridDescriptor::nameAsString(entry.descriptor.uniqueName()));
+    out["value_type"] = text(entry.grid ? entry.grid->valueType() : entry.descriptor.gridType());
+    out["half"] = entry.descriptor.saveFloatAsHalf();
+    out["known"] = static_cast<bool>(entry.grid);
+    return out;
+}
+
+// Row-major 4 x 4 in the column-vector convention (OpenVDB multiplies rows from the left); None when the map is not affine.
+nb::object index_to_world(const openvdb::math::Transform& transform) {
+    if (!transform.isLinear()) {
+        return nb::none();
+    }
+    const openvdb::Mat4d m = transform.baseMap()->getAffineMap()->getMat4();
+    nb::list rows;
+    for (int r = 0; r < 4; ++r) {
+        nb::list row;
+        for (int c = 0; c < 4; ++c) {
+            row.append(m(c, r));
+        }
+        rows.append(row);
+    }
+    return rows;
+}
+
+nb::dict describe(const Entry& entry, const openvdb::GridBase& grid) {
+    nb::dict out = header(entry);
+    out["grid_class"] = text(openvdb::GridBase::gridClassToString(grid.getGridClass()));
+    out["transform_type"] = text(grid.transform().mapType());
+    out["index_to_world"] = index_to_world(grid.transform());
+    const openvdb::Vec3d size = grid.transform().isLinear() ? grid.voxelSize() : openvdb::Vec3d(0.0);
+    out["voxel_size"] = nb::make_tuple(size.x(), size.y(), size.z());
+    out["active_voxels"] = static_cast<std::uint64_t>(grid.activeVoxelCount());
+    const openvdb::CoordBBox box = grid.evalActiveVoxelBoundingBox();
+    if (box.empty()) {
+        out["index_box"] = nb::none();
+    } else {
+        out["index_box"] = nb::make_tuple(nb::make_tuple(box.min().x(), box.min().y(), box.min().z()),
+                                          nb::make_tuple(box.max().x(), box.max().y(), box.max().z()));
+    }
+    nb::dict metadata;
+    for (auto it = grid.beginMeta(); it != grid.endMeta(); ++it) {
+        if (it->second) {
+            metadata[text(it->first)] = metadata_value(*it->second);
+        }
+    }
+    out["metadata"] = metadata;
+    return out;
+}
+
+nb::list read_headers(const std::string& path) {
+    const Reader reader(path);
+    nb::list out;
+    for (const Entry& entry : reader.entries()) {
+        out.append(header(entry));
+    }
+    return out;
+}
+
+nb::dict describe_grid(const std::string& path, std::size_t index) {
+    Reader reader(path);
+    openvdb::GridBase::Ptr grid;
+    {
+        nb::gil_scoped_release release;
+        grid = reader.load(index);
+    }
+    return describe(reader.at(index), *grid);
+}
+
+using DenseArray = nb::ndarray<nb::numpy, float, nb::ndim<3>, nb::c_contig>;
+
+nb::tuple read_dense(const std::string& path, std::size_t index, std::uint64_t max_voxels) {
+    Reader reader(path);
+    openvdb::GridBase::Ptr base;
+    {
+        nb::gil_scoped_release release;
+        base = reader.load(index);
+    }
+    const auto grid = openvdb::gridPtrCast<openvdb::FloatGrid>(base);
+    if (!grid) {
+        throw VdbError("the grid '" + base->getName() + "' holds " + base->valueType() + " values, not float");
+    }
+    nb::dict info = describe(reader.at(index), *grid);
+    info["background"] = grid->background();
+    const openvdb::CoordBBox box = grid->evalActiveVoxelBoundingBox();
+    if (box.empty()) {
+        return nb::make_tuple(info, nb::none());
+    }
+    // The corners of a box are 32-bit integers: its extents need 64, its volume may need more.
+    std::uint64_t extent[3];
+    double voxels = 1;
+    for (int axis = 0; axis < 3; ++axis) {
+        extent[axis] = static_cast<std::uint64_t>(static_cast<std::int64_t>(box.max()[axis]) - box.min()[axis] + 1);
+        voxels *= static_cast<double>(extent[axis]);
+    }
+    if (voxels > static_cast<double>(max_voxels)) {
+        throw VdbError("the grid '" + grid->getName() + "' spans " + std::to_string(extent[0]) + " x " + std::to_string(extent[1]) + " x " +
+                       std::to_string(extent[2]) + " voxels, more than the " + std::to_string(max_voxels) + " that are read densely");
+    }
+    auto* values = new float[static_cast<std::size_t>(voxels)];
+    const nb::capsule owner(values, [](void* p) noexcept { delete[] static_cast<float*>(p); });
+    {
+        nb::gil_scoped_release release;
+        openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ> dense(box, values);
+        openvdb::tools::copyToDense(*grid, dense);
+    }
+    return nb::make_tuple(info, DenseArray(values, {extent[2], extent[1], extent[0]}, owner));
+}
+
+void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>& density,
+                 const nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>& index_to_world, const std::string& name,
+                 bool half, bool prune, const nb::dict& metadata) {
+    openvdb::FloatGrid::Ptr grid = openvdb::FloatGrid::create(0.0f);
+    grid->setName(name);
+    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+    grid->setSaveFloatAsHalf(half);
+    for (const auto& [key, value] : metadata) {
+        const auto k = nb::cast<std::string>(key);
+        if (nb::isinstance<nb::bool_>(value)) {
+            grid->insertMeta(k, openvdb::BoolMetadata(nb::cast<bool>(value)));
+        } else if (nb::isinstance<nb::int_>(value)) {
+            grid->insertMeta(k, openvdb::Int64Metadata(nb::cast<std::int64_t>(value)));
+        } else if (nb::isinstance<nb::float_>(value)) {
+            grid->insertMeta(k, openvdb::DoubleMetadata(nb::cast<double>(value)));
+        } else {
+            grid->insertMeta(k, openvdb::StringMetadata(nb::cast<std::string>(value)));
+        }
+    }
+    nb::gil_scoped_release release;
+    openvdb::Mat4d m;
+    for (int r = 0; r < 4; ++r) {
+        for (int c = 0; c < 4; ++c) {
+            m(c, r) = index_to_world(r, c);
+        }
+    }
+    grid->setTransform(openvdb::math::Transform::createLinearTransform(m));
+    const auto last = [](std::size_t n) { return static_cast<int>(n) - 1; };
+    const openvdb::CoordBBox box({0, 0, 0}, {last(density.shape(2)), last(density.shape(1)), last(density.shape(0))});
+    // Dense holds a pointer to mutable values but copyFromDense only reads them.
+    const openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ> dense(box, const_cast<float*>(density.data()));
+    // Values equal to the background (0) stay inactive.
+    openvdb::tools::copyFromDense(dense, *grid, 0.0f);
+    if (prune) {
+        grid->pruneGrid();
+    } else {
+        grid->tree().voxelizeActiveTiles();
+    }
+    openvdb::io::File file(path);
+    file.write({grid});
+    file.close();
+}
+
+}  // namespace
+
+NB_MODULE(_openvdb, m) {
+    openvdb::initialize();
+    nb::exception<VdbError>(m, "VdbError", PyExc_RuntimeError);
+    // OpenVDB's own exceptions and those of the stream and of memory, in the order in which they are tried (the last registered first).
+    nb::register_exception_translator(
+        [](const std::exception_ptr& thrown, void* type) {
+            try {
+                std::rethrow_exception(thrown);
+            } catch (const openvdb::Exception& error) {
+                PyErr_SetString(static_cast<PyObject*>(type), error.what());
+            } catch (const std::ios_base::failure&) {
+                PyErr_SetString(static_cast<PyObject*>(type), "the file ends too early or cannot be read");
+            } catch (const std::length_error&) {
+                PyErr_SetString(static_cast<PyObject*>(type), "the file asks for an impossible amount of memory: it is damaged");
+            }
+        },
+        m.attr("VdbError").ptr());
+    m.attr("library_version") = std::string(openvdb::getLibraryVersionString());
+    m.def("read_headers", &read_headers, nb::arg("path"));
+    m.def("describe_grid", &describe_grid, nb::arg("path"), nb::arg("index"));
+    m.def("read_dense", &read_dense, nb::arg("path"), nb::arg("index"), nb::arg("max_voxels"));
+    m.def("write_dense", &write_dense, nb::arg("path"), nb::arg("density"), nb::arg("index_to_world"), nb::arg("name"), nb::arg("half"),
+          nb::arg("prune"), nb::arg("metadata"));
+}

@@ -1,0 +1,1 @@
+"""A released model at work: prediction, and rendering with Mitsuba."""

@@ -1,0 +1,1 @@
+"""Training side of deepclouds: clouds, labels, data sets, training and export."""
