@@ -1,0 +1,19 @@
+"""Procedural cloud families: seeded functions of a few named parameters, each returning a `Volume`."""
+
+from deepclouds_training.clouds._make import FAMILIES, HELD_OUT, TRAINING, Family, draw_parameters, find_family, make_cloud
+from deepclouds_training.clouds._parameters import Choice, CloudParameters, Range
+from deepclouds_training.clouds._raster import weighted_mean
+
+__all__ = [
+    "FAMILIES",
+    "HELD_OUT",
+    "TRAINING",
+    "Choice",
+    "CloudParameters",
+    "Family",
+    "Range",
+    "draw_parameters",
+    "find_family",
+    "make_cloud",
+    "weighted_mean",
+]

@@ -1,0 +1,110 @@
+"""The families by name, and the one function that makes a cloud of any of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from deepclouds.errors import InputError
+from deepclouds.volume import Volume
+from deepclouds_training.clouds import congestus, cumulus, cumulus_field, fractus, plume, shapes, stratus
+from deepclouds_training.clouds._parameters import Choice, CloudParameters, Range, domains, named_streams, resolve
+from deepclouds_training.clouds._raster import Field, rasterise
+
+_ATTEMPTS = 16
+_COARSEST = 8
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Family:
+    """One kind of cloud.
+
+    Parameters
+    ----------
+    name, summary
+        its name, and a line about it.
+    parameters
+        frozen dataclass of its parameters; `ranges` gives their domains.
+    build
+        from parameters and named random streams to a density over space.
+    """
+
+    name: str
+    summary: str
+    parameters: type[CloudParameters]
+    build: Callable[[Any, Callable[[str], Any]], Field]
+
+    @property
+    def ranges(self) -> dict[str, Range | Choice]:
+        """Domain of each parameter."""
+        return domains(self.parameters)
+
+
+_ALL = (
+    Family("cumulus", "a heap with a flat base and a cauliflower top", cumulus.CumulusParameters, cumulus.build),
+    Family("stratus", "a layer, closed or broken, its sides cut by the box or fading", stratus.StratusParameters, stratus.build),
+    Family("congestus", "a tall tower of rising bulbs, without an anvil", congestus.CongestusParameters, congestus.build),
+    Family("fractus", "wind-torn shreds with strong contrast of density", fractus.FractusParameters, fractus.build),
+    Family(
+        "cumulus_field", "several separate cumuli on one base level", cumulus_field.CumulusFieldParameters, cumulus_field.build
+    ),
+    Family("plume", "buoyant smoke that rolls up into swirls", plume.PlumeParameters, plume.build),
+    Family("shapes", "simple shapes, homogeneous or graded, hard or soft", shapes.ShapesParameters, shapes.build),
+)
+FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
+HELD_OUT: tuple[str, ...] = ("congestus", "plume")
+TRAINING: tuple[str, ...] = tuple(name for name in FAMILIES if name not in HELD_OUT)
+
+
+def find_family(name: str) -> Family:
+    """Return the family called `name`; InputError when there is none."""
+    if name not in FAMILIES:
+        raise InputError(f"unknown cloud family '{name}'; there are: {', '.join(FAMILIES)}")
+    return FAMILIES[name]
+
+
+def draw_parameters(family: str, seed: int, **parameters: Any) -> CloudParameters:
+    """All parameters of the cloud that `make_cloud` makes from the same arguments."""
+    kind = find_family(family)
+    return resolve(kind.parameters, family, parameters, named_streams(seed, family, "parameters"))
+
+
+def make_cloud(family: str, seed: int, resolution: int, **parameters: Any) -> Volume:
+    """Make one cloud: the same arguments give the same bytes.
+
+    Parameters
+    ----------
+    family
+        one of `FAMILIES`.
+    seed
+        root of every random number, not negative.
+    resolution
+        samples along the most finely divided axis, at least 8; details grow with it, the form stays.
+    parameters
+        values by name, within the family's ranges; those not given are drawn from their ranges with the seed.
+
+    Returns
+    -------
+    Volume
+        density with maximum 1 (relative extinction), in a box centred on the origin whose longest side is 2 world units, Y up.
+
+    Raises
+    ------
+    InputError
+        for an unknown family or parameter, a value outside its range, a negative seed or a resolution below 8.
+    """
+    kind = find_family(family)
+    if seed < 0:
+        raise InputError(f"seed = {seed} is negative; it takes 0 or more")
+    if resolution < _COARSEST:
+        raise InputError(f"resolution = {resolution} is too coarse for a cloud; it takes {_COARSEST} or more")
+    values = draw_parameters(family, seed, **parameters)
+    for attempt in range(_ATTEMPTS):
+        volume = rasterise(kind.build(values, named_streams(seed, family, f"attempt {attempt}")), resolution, values.voxel_aspect)
+        if volume is not None:
+            return volume
+        _log.debug("%s with seed %d came out empty at attempt %d", family, seed, attempt)
+    raise InputError(f"{family} with seed {seed} and {values} stays empty after {_ATTEMPTS} attempts; choose another seed or milder parameters")

@@ -1,0 +1,46 @@
+"""Cumulus congestus: a tall tower of rising bulbs without an anvil."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepclouds_training.clouds._heap import HeapParameters, heap
+from deepclouds_training.clouds._parameters import Streams, number
+from deepclouds_training.clouds._raster import Field
+from deepclouds_training.clouds._turrets import bud
+
+
+@dataclass(frozen=True, kw_only=True)
+class CongestusParameters(HeapParameters):
+    """Parameters of a congestus."""
+
+    height: float = number(1.6, 3.2, "height of the tower over the width of its base")
+    bulbs: int = number(4, 8, "bulbs that rise one above the other", integer=True)
+    shear: float = number(0.0, 0.35, "how far the top leans over the base, over the height")
+    shoulders: int = number(2, 5, "lower towers beside the main one", integer=True)
+
+
+def build(parameters: CongestusParameters, streams: Streams) -> Field:
+    rng = streams("towers")
+    height, balls = parameters.height, []
+    for k in range(parameters.bulbs):
+        t = k / (parameters.bulbs - 1)
+        # A waist above the base and a swollen head, as a rising thermal has.
+        radius = (0.46 - 0.16 * np.sin(np.pi * min(1.25 * t, 1.0)) - 0.08 * t) * rng.uniform(0.9, 1.15)
+        y = 0.15 + t * (height - 0.15 - radius)
+        drift = rng.normal(0, 0.07, 2)
+        balls.append((parameters.shear * y + drift[0], y, drift[1], radius))
+        # Between bulbs the tower is filled, or tall thin towers fall apart.
+        if k:
+            low = balls[-2 if k == 1 else -3]
+            balls.append(tuple(0.5 * (np.array(low) + np.array(balls[-1])) * (1, 1, 1, 0.85)))
+            balls[-1], balls[-2] = balls[-2], balls[-1]
+    for k in range(parameters.shoulders):
+        angle = 2 * np.pi * (k * 0.618 + 0.2 * rng.random())
+        top = height * rng.uniform(0.15, 0.5)
+        radius = rng.uniform(0.24, 0.34)
+        for y in np.arange(0.1, top, 0.7 * radius):
+            balls.append((0.45 * np.cos(angle) + parameters.shear * y, y, 0.45 * np.sin(angle), radius * rng.uniform(0.85, 1.1)))
+    return heap(bud(rng, np.array(balls), 2, 7, 0.45, upward=0.3, floor=0.0), parameters, streams, turret=0.26, base=0.0)
