@@ -1,0 +1,48 @@
+"""The Dr.Jit types a kernel runs on: LLVM on the processor or CUDA on a GPU, chosen by name."""
+
+from __future__ import annotations
+
+import glob
+import importlib
+import os
+from functools import cache
+from types import ModuleType
+
+from deepclouds.errors import InputError
+
+NAMES = ("llvm", "cuda")
+_LLVM_PATTERNS = (
+    "/usr/lib/*-linux-gnu/libLLVM-[0-9]*.so.1",
+    "/usr/lib/*-linux-gnu/libLLVM.so.[0-9]*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/opt/homebrew/opt/llvm/lib/libLLVM.dylib",
+)
+
+
+@cache
+def backend(name: str = "llvm") -> ModuleType:
+    """The module ``drjit.llvm`` or ``drjit.cuda``, whose types (Float, Array3f, ...) every kernel takes as its first argument.
+
+    Raises
+    ------
+    InputError
+        for an unknown name, or when the LLVM library or the CUDA driver is missing.
+    """
+    if name not in NAMES:
+        raise InputError(f"unknown backend '{name}'; there are: {', '.join(NAMES)}")
+    if name == "llvm" and "DRJIT_LIBLLVM_PATH" not in os.environ:
+        found = sorted(path for pattern in _LLVM_PATTERNS for path in glob.glob(pattern))
+        if found:
+            os.environ["DRJIT_LIBLLVM_PATH"] = found[-1]
+    import drjit as dr
+
+    module = importlib.import_module(f"drjit.{name}")
+    if not dr.has_backend(dr.JitBackend.LLVM if name == "llvm" else dr.JitBackend.CUDA):
+        remedy = (
+            "install LLVM (Debian: apt-get install libllvm19) or point DRJIT_LIBLLVM_PATH at libLLVM.so"
+            if name == "llvm"
+            else "install the NVIDIA driver or use the backend 'llvm'"
+        )
+        raise InputError(f"the Dr.Jit backend '{name}' is not available: {remedy}")
+    return module

@@ -1,0 +1,218 @@
+"""Monte Carlo labels: multiple scattering J at given points, by delta tracking with next-event estimation.
+
+One walk serves several suns and several albedos: the walk does not depend on either (brief: the label's definition in
+docs/conventions.md). The estimator is
+
+    j = 4 pi J / (albedo^2 E) = sum over collisions i >= 1 of albedo^(i - 1) 4 pi p(w_i . omega_sun) T(x_i -> omega_sun)
+
+over a walk that leaves the point x in a direction drawn from the phase function around w; x itself is never connected to the sun.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.medium.field import Field
+from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
+
+def trace_walks(
+    field: Field,
+    points: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    g: NDArray[np.float32],
+    suns: NDArray[np.float32],
+    albedos: NDArray[np.float32],
+    walks: int,
+    seed: int,
+    lanes: int = 4096,
+    connect: float = 1.0,
+) -> NDArray[np.float32]:
+    """Unbiased estimates of ``4 pi J / (albedo^2 E)``, one for every walk.
+
+    Parameters
+    ----------
+    field
+        the extinction.
+    points
+        (n, 3) world points, inside or outside of the box.
+    directions
+        (n, 3) unit vectors w, the camera ray's travel.
+    g
+        (n,) Henyey-Greenstein parameters, -1 < g < 1.
+    suns
+        (n, k, 3) unit vectors TOWARD the suns that every walk of a point is connected to.
+    albedos
+        (n, m) single-scattering albedos evaluated for every walk.
+    walks
+        walks per point.
+    seed
+        root of the random streams; a walk's stream depends on `seed` and its own number alone, so the result does not depend on
+        `lanes` or on the scheduling.
+    lanes
+        walks in flight; each lane takes the next walk as soon as its own has ended, and every walk that started is finished.
+    connect
+        a collision is connected to a sun with probability ``min(1, connect * 4 pi p)``, weighted by its inverse: the connections
+        that carry little are thinned out, without bias.
+
+    Returns
+    -------
+    float32 array (n, walks, k, m).
+
+    Notes
+    -----
+    One global majorant. The roulette of a connection sees the walk's past only. Shadow rays are delta tracked (0 or 1).
+    Source: Woodcock et al. 1965; Novak et al. 2018 (CGF 37(2), sections 5 and 6).
+    """
+    n, k_suns, m_albedos = len(points), suns.shape[1], albedos.shape[1]
+    total = n * walks
+    if total == 0 or field.majorant == 0.0:
+        return np.zeros((n, walks, k_suns, m_albedos), np.float32)
+    if total * k_suns * m_albedos >= 2**31:
+        raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
+    types = field.types
+    queries = _Queries(types, points, directions, g, suns, albedos)
+    result = dr.zeros(types.Float, total * k_suns * m_albedos)
+    counter = dr.zeros(types.UInt32, 1)
+    key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
+    dr.make_opaque(result, counter, key)
+    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect)
+    return np.array(result).reshape(n, walks, k_suns, m_albedos)
+
+
+class _Queries:
+    """The arrays a walk starts from, on the device."""
+
+    def __init__(self, types: Any, points: Any, directions: Any, g: Any, suns: Any, albedos: Any) -> None:
+        def upload(values: Any) -> Any:
+            return types.Float(np.ascontiguousarray(values, np.float32))
+
+        self.points = [upload(points[:, c]) for c in range(3)]
+        self.directions = [upload(directions[:, c]) for c in range(3)]
+        self.g = upload(g)
+        self.suns = [[upload(suns[:, k, c]) for c in range(3)] for k in range(suns.shape[1])]
+        self.albedos = [upload(albedos[:, m]) for m in range(albedos.shape[1])]
+        dr.eval(self.points, self.directions, self.g, self.suns, self.albedos)
+
+
+def _uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any]:
+    """The next state and a number in [0, 1) of xoroshiro64* (Blackman and Vigna 2021), which needs 32-bit arithmetic alone."""
+    s0, s1 = rng
+    bits = s0 * 0x9E3779BB
+    s1 = s1 ^ s0
+    s0 = ((s0 << 26) | (s0 >> 6)) ^ s1 ^ (s1 << 9)
+    s1 = (s1 << 13) | (s1 >> 19)
+    return [s0, s1], types.Float(bits >> 8) * (1.0 / 16777216.0)
+
+
+def _stream(types: Any, key: Any, number: Any) -> list[Any]:
+    """The starting state of the walk `number`: SplitMix64 of key and number (Steele et al. 2014)."""
+    z = key + types.UInt64(number) * 0x9E3779B97F4A7C15
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB
+    z = z ^ (z >> 31)
+    return [types.UInt32(z & 0xFFFFFFFF) | 1, types.UInt32(z >> 32)]
+
+
+@dr.syntax
+def _loop(
+    field: Field, queries: _Queries, walks: int, total: int, key: Any, counter: Any, result: Any, lanes: int, connect: float
+) -> None:
+    types = field.types
+    Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
+    k_suns, m_albedos = len(queries.suns), len(queries.albedos)
+    majorant = dr.opaque(Float, field.majorant)
+    inverse_majorant = dr.opaque(Float, 1.0 / field.majorant)
+    walks_each = dr.opaque(UInt32, walks)
+    limit = dr.opaque(UInt32, total)
+    connect_4pi = dr.opaque(Float, 4.0 * np.pi * connect)
+    least = dr.opaque(Float, 1.0 / connect)
+
+    alive = dr.full(Bool, True, lanes)
+    ended = dr.full(Bool, True, lanes)
+    number = dr.full(UInt32, 0xFFFFFFFF, lanes)
+    rng = [dr.zeros(UInt32, lanes), dr.zeros(UInt32, lanes)]
+    position = dr.zeros(Array3f, lanes)  # of the last collision, in the unit cube of the box
+    direction = dr.zeros(Array3f, lanes)  # of the walk, world
+    distance = dr.zeros(Float, lanes)  # along the current segment, world units
+    g = dr.zeros(Float, lanes)
+    pending = dr.zeros(UInt32, lanes)  # bit k: the connection to sun k is still to be traced
+    suns = [dr.zeros(Array3f, lanes) for _ in range(k_suns)]
+    albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
+    weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
+    sums = [dr.zeros(Float, lanes) for _ in range(k_suns * m_albedos)]
+
+    while alive:
+        if ended:
+            # Hand in the finished walk, take the next one; a lane retires when none is left.
+            finished = number != 0xFFFFFFFF
+            for i in range(k_suns * m_albedos):
+                dr.scatter(result, sums[i], number * (k_suns * m_albedos) + i, finished)
+                sums[i] = Float(0)
+            number = dr.scatter_inc(counter, UInt32(0), Bool(True))
+            alive = number < limit
+            point = number // walks_each
+            rng = _stream(types, key, number)
+            g = dr.gather(Float, queries.g, point, alive)
+            rng, u_cosine = _uniform(types, rng)
+            rng, u_azimuth = _uniform(types, rng)
+            incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
+            direction = rotate_to(incoming, sample_hg_cosine(u_cosine, g), 2 * np.pi * u_azimuth)
+            origin = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.points))
+            enter, leave = field.intersect(origin, direction)
+            position = field.to_unit(origin)
+            # A ray that misses the box starts beyond it, and so escapes at its first step.
+            distance = dr.select(leave > enter, enter, dr.largest(Float) * 1e-6)
+            for k in range(k_suns):
+                suns[k] = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.suns[k]))
+            for m in range(m_albedos):
+                albedo[m] = dr.gather(Float, queries.albedos[m], point, alive)
+                weight[m] = Float(1)
+            pending = UInt32(0)
+            ended = Bool(False)
+
+        shadow = pending != 0
+        lowest = pending & (~pending + 1)
+        sun = suns[0]
+        for k in range(1, k_suns):
+            sun = dr.select(lowest == (1 << k), suns[k], sun)
+        heading = dr.select(shadow, sun, direction)
+
+        rng, u_step = _uniform(types, rng)
+        rng, u_event = _uniform(types, rng)
+        distance -= dr.log(1 - u_step) * inverse_majorant
+        unit = dr.fma(field.direction_to_unit(heading), distance, position)
+        inside = (unit.x >= 0) & (unit.x <= 1) & (unit.y >= 0) & (unit.y <= 1) & (unit.z >= 0) & (unit.z <= 1) & alive
+        sigma = field.sigma_t_unit(unit, inside)
+        hit = inside & (u_event * majorant < sigma)
+
+        collision = hit & ~shadow
+        connected = shadow & ~inside
+        value = dr.select(connected, dr.maximum(4 * np.pi * hg(dr.dot(direction, sun), g), least), 0)
+        for k in range(k_suns):
+            mine = connected & (lowest == (1 << k))
+            for m in range(m_albedos):
+                sums[k * m_albedos + m] += dr.select(mine, value * weight[m], 0)
+        pending = dr.select(connected | (shadow & hit), pending & ~lowest, pending)
+
+        # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connections.
+        u_connect = u_event * majorant / sigma
+        chosen = UInt32(0)
+        for k in range(k_suns):
+            u_k = u_connect + 0.6180339887 * k
+            u_k = u_k - dr.floor(u_k)
+            chosen |= dr.select(u_k < connect_4pi * hg(dr.dot(direction, suns[k]), g), UInt32(1 << k), UInt32(0))
+        pending = dr.select(collision, chosen, pending)
+        position = dr.select(collision, unit, position)
+        distance = dr.select(collision | connected | (shadow & hit), 0, distance)
+
+        turn = (pending == 0) & (collision | (shadow & (connected | hit)))
+        rng, u_cosine = _uniform(types, rng)
+        rng, u_azimuth = _uniform(types, rng)
+        direction = dr.select(turn, rotate_to(direction, sample_hg_cosine(u_cosine, g), 2 * np.pi * u_azimuth), direction)
+        for m in range(m_albedos):
+            weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
+        ended = alive & ~inside & ~shadow

@@ -1,0 +1,88 @@
+"""Optical depth along straight segments, by a jittered midpoint march with steps of half a voxel.
+
+A trilinear field is smooth inside a cell, so the march errs far less than any tabulated transmittance; the jitter makes it unbiased
+in tau. In a homogeneous box it is exact.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from deepclouds.medium.field import Field
+
+# exp(-TAU_OPAQUE) is below the last digit of a float32 sum of order 1.
+TAU_OPAQUE = 20.0
+
+
+@dr.syntax
+def optical_depth(field: Field, origin: Any, direction: Any, start: Any, end: Any, jitter: Any, active: Any, opaque: float = TAU_OPAQUE) -> Any:
+    """Optical depth of the segments from `start` to `end` along rays, inside the box; a march stops once tau exceeds `opaque`.
+
+    Parameters
+    ----------
+    field
+        the extinction.
+    origin, direction
+        world points and unit vectors.
+    start, end
+        distances, world units; clipped to the box.
+    jitter
+        place of the sample inside each step, in [0, 1): 0.5 for the midpoint rule.
+    active
+        lanes to compute; the others return 0.
+    """
+    types = field.types
+    enter, leave = field.intersect(origin, direction)
+    first = dr.maximum(enter, start)
+    length = dr.select(active, dr.maximum(dr.minimum(leave, end) - first, 0), 0)
+    steps = dr.ceil(length / field.step)
+    width = length / dr.maximum(steps, 1)
+    base = field.to_unit(origin)
+    along = field.direction_to_unit(direction)
+    tau = dr.zeros(types.Float, dr.width(length))
+    index = dr.zeros(types.Float, dr.width(length))
+    going = active & (steps > 0)
+    while going:
+        distance = first + (index + jitter) * width
+        tau += width * field.sigma_t_unit(dr.fma(along, distance, base), going)
+        index += 1
+        going = going & (index < steps) & (tau < opaque)
+    return tau
+
+
+@dr.syntax
+def distance_at(
+    field: Field, origin: Any, direction: Any, start: Any, end: Any, jitter: Any, target: Any, active: Any
+) -> tuple[Any, Any]:
+    """Distance at which the optical depth from `start` reaches `target`, by the march of `optical_depth` with the same jitter.
+
+    Returns the distance and the extinction there (that of the march's step); with a target beyond the segment's optical depth the
+    distance is that of its end.
+    """
+    types = field.types
+    enter, leave = field.intersect(origin, direction)
+    first = dr.maximum(enter, start)
+    length = dr.select(active, dr.maximum(dr.minimum(leave, end) - first, 0), 0)
+    steps = dr.ceil(length / field.step)
+    width = length / dr.maximum(steps, 1)
+    base = field.to_unit(origin)
+    along = field.direction_to_unit(direction)
+    tau = dr.zeros(types.Float, dr.width(length))
+    index = dr.zeros(types.Float, dr.width(length))
+    found = first + dr.zeros(types.Float, dr.width(length))
+    density = dr.zeros(types.Float, dr.width(length))
+    going = active & (steps > 0)
+    while going:
+        near = first + index * width
+        sigma = field.sigma_t_unit(dr.fma(along, near + jitter * width, base), going)
+        reached = tau + width * sigma
+        inside = reached >= target
+        fraction = dr.select(inside & (sigma > 0), (target - tau) / (sigma * width), 1.0)
+        found = dr.select(going, near + dr.clip(fraction, 0, 1) * width, found)
+        density = dr.select(going, sigma, density)
+        tau = reached
+        index += 1
+        going = going & (index < steps) & ~inside
+    return found, density

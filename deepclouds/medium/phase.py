@@ -1,0 +1,61 @@
+"""Henyey-Greenstein phase function: value, logarithm and sampling, for Dr.Jit arrays and NumPy alike.
+
+Convention: ``cos_theta`` is the cosine between the directions of travel before and after the scattering, so ``g > 0`` is bright
+looking into the sun; `phase` integrates to 1 over the sphere (Henyey and Greenstein 1941).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+INV_4PI = 0.07957747154594767
+
+
+def hg(cos_theta: Any, g: Any) -> Any:
+    """Phase function value, 1/sr, of Dr.Jit arrays `cos_theta` and `g` (-1 < g < 1)."""
+    import drjit as dr
+
+    # (1 - |g|)^2 + 2 |g| (1 -+ cos) keeps its digits where 1 + g^2 - 2 g cos cancels.
+    a = dr.abs(g)
+    denominator = dr.square(1 - a) + 2 * a * (1 - dr.select(g < 0, -cos_theta, cos_theta))
+    return INV_4PI * (1 - a) * (1 + a) * dr.rcp(denominator * dr.sqrt(denominator))
+
+
+def hg_numpy(cos_theta: ArrayLike, g: ArrayLike) -> NDArray[np.float64]:
+    """The readable twin of `hg` in float64."""
+    cos_theta, g = np.asarray(cos_theta, np.float64), np.asarray(g, np.float64)
+    value: NDArray[np.float64] = INV_4PI * (1 - g**2) / (1 + g**2 - 2 * g * cos_theta) ** 1.5
+    return value
+
+
+def sample_hg_cosine(u: Any, g: Any) -> Any:
+    """Cosine of the scattering angle by inversion of the cumulative HG density, from `u` in [0, 1)."""
+    import drjit as dr
+
+    small = dr.abs(g) < 1e-3
+    safe = dr.select(small, 1e-3, g)
+    ratio = (1 - safe * safe) / (1 - safe + 2 * safe * u)
+    cosine = (1 + safe * safe - ratio * ratio) / (2 * safe)
+    return dr.clip(dr.select(small, 1 - 2 * u, cosine), -1, 1)
+
+
+def rotate_to(direction: Any, cosine: Any, azimuth: Any) -> Any:
+    """Unit vectors at `cosine` and `azimuth` (radians) around the unit vectors `direction` (Duff et al. 2017, JCGT 6(1))."""
+    import drjit as dr
+
+    sine = dr.safe_sqrt(1 - cosine * cosine)
+    sin_a, cos_a = dr.sincos(azimuth)
+    x, y, z = direction
+    sign = dr.select(z < 0, -1.0, 1.0)
+    a = -dr.rcp(sign + z)
+    b = x * y * a
+    u, v = sine * cos_a, sine * sin_a
+    rotated = type(direction)(
+        u * (1 + sign * x * x * a) + v * b + cosine * x,
+        u * sign * b + v * (sign + y * y * a) + cosine * y,
+        u * (-sign * x) + v * (-y) + cosine * z,
+    )
+    return dr.normalize(rotated)
