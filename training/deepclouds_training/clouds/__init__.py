@@ -3,6 +3,7 @@
 from deepclouds_training.clouds._make import FAMILIES, HELD_OUT, TRAINING, Family, draw_parameters, find_family, make_cloud
 from deepclouds_training.clouds._parameters import Choice, CloudParameters, Range
 from deepclouds_training.clouds._raster import weighted_mean
+from deepclouds_training.clouds.scene import scale_for_optical_depth, write_mitsuba_scene
 
 __all__ = [
     "FAMILIES",
@@ -15,5 +16,7 @@ __all__ = [
     "draw_parameters",
     "find_family",
     "make_cloud",
+    "scale_for_optical_depth",
     "weighted_mean",
+    "write_mitsuba_scene",
 ]

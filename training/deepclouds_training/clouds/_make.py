@@ -48,9 +48,7 @@ _ALL = (
     Family("stratus", "a layer, closed or broken, its sides cut by the box or fading", stratus.StratusParameters, stratus.build),
     Family("congestus", "a tall tower of rising bulbs, without an anvil", congestus.CongestusParameters, congestus.build),
     Family("fractus", "wind-torn shreds with strong contrast of density", fractus.FractusParameters, fractus.build),
-    Family(
-        "cumulus_field", "several separate cumuli on one base level", cumulus_field.CumulusFieldParameters, cumulus_field.build
-    ),
+    Family("cumulus_field", "several separate cumuli on one base level", cumulus_field.CumulusFieldParameters, cumulus_field.build),
     Family("plume", "buoyant smoke that rolls up into swirls", plume.PlumeParameters, plume.build),
     Family("shapes", "simple shapes, homogeneous or graded, hard or soft", shapes.ShapesParameters, shapes.build),
 )
@@ -107,4 +105,6 @@ def make_cloud(family: str, seed: int, resolution: int, **parameters: Any) -> Vo
         if volume is not None:
             return volume
         _log.debug("%s with seed %d came out empty at attempt %d", family, seed, attempt)
-    raise InputError(f"{family} with seed {seed} and {values} stays empty after {_ATTEMPTS} attempts; choose another seed or milder parameters")
+    raise InputError(
+        f"{family} with seed {seed} and {values} stays empty after {_ATTEMPTS} attempts; choose another seed or milder parameters"
+    )

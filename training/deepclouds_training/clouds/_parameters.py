@@ -138,5 +138,5 @@ def resolve(kind: type[CloudParameters], family: str, given: Mapping[str, Any], 
     for name in given:
         if name not in known:
             raise InputError(f"the cloud family {family} has no parameter '{name}'; it has: {', '.join(known)}")
-    values = {name: d.check(name, given[name]) if name in given else d.draw(streams(name)) for name, d in known.items()}
+    values: dict[str, Any] = {name: d.check(name, given[name]) if name in given else d.draw(streams(name)) for name, d in known.items()}
     return kind(**values)

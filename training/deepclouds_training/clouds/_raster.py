@@ -40,7 +40,7 @@ class Grid:
         return len(self.z), len(self.y), len(self.x)
 
     def open(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """x (1, 1, nx), y (1, ny, 1), z (nz, 1, 1): positions that broadcast to the grid."""
+        """Positions that broadcast to the grid: x (1, 1, nx), y (1, ny, 1), z (nz, 1, 1)."""
         return self.x[None, None, :], self.y[None, :, None], self.z[:, None, None]
 
 

@@ -23,6 +23,7 @@ class CongestusParameters(HeapParameters):
 
 
 def build(parameters: CongestusParameters, streams: Streams) -> Field:
+    """Density of a congestus over space; the base lies at y = 0 and is about 1 wide."""
     rng = streams("towers")
     height, balls = parameters.height, []
     for k in range(parameters.bulbs):

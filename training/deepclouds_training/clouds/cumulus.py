@@ -42,6 +42,7 @@ def towers(rng: np.random.Generator, count: int, width: float, depth: float, she
 
 
 def build(parameters: CumulusParameters, streams: Streams) -> Field:
+    """Density of a cumulus over space; the base lies at y = 0, the top near 1."""
     rng = streams("towers")
     trunk = towers(rng, parameters.turrets, parameters.width, parameters.depth, parameters.shear)
     balls = bud(rng, trunk, 2, 7, 0.46, upward=0.35, floor=0.0)

@@ -23,6 +23,7 @@ class CumulusFieldParameters(HeapParameters):
 
 
 def build(parameters: CumulusFieldParameters, streams: Streams) -> Field:
+    """Density of a field of cumuli over space; the bases lie at y = 0."""
     rng = streams("field")
     placed: list[tuple[float, float, float]] = []
     every = []
@@ -36,7 +37,9 @@ def build(parameters: CumulusFieldParameters, streams: Streams) -> Field:
                 break
             reach += 0.05 * radius
         placed.append((x, z, radius))
-        body = towers(rng, int(rng.integers(2, 6)), 1.3 * size, rng.uniform(0.6, 1.0), rng.uniform(0, 0.3), height=size * rng.uniform(0.6, 1))
+        body = towers(
+            rng, int(rng.integers(2, 6)), 1.3 * size, rng.uniform(0.6, 1.0), rng.uniform(0, 0.3), height=size * rng.uniform(0.6, 1)
+        )
         body = bud(rng, body, 2, 5, 0.46, upward=0.35, floor=0.0)
         body[:, [0, 2]] += (x, z)
         every.append(body)

@@ -24,6 +24,7 @@ class FractusParameters(CloudParameters):
 
 
 def build(parameters: FractusParameters, streams: Streams) -> Field:
+    """Density of torn shreds over space; the envelope is 1 wide across the wind."""
     eddies = [SmoothNoise.draw(streams(f"eddies {axis}")) for axis in "xyz"]
     shreds = WarpedNoise.draw(streams("shreds"), cells=6, octaves=4, gain=0.6)
     length, height = parameters.length, parameters.height

@@ -25,6 +25,7 @@ class PlumeParameters(CloudParameters):
 
 
 def build(parameters: PlumeParameters, streams: Streams) -> Field:
+    """Density of a plume over space; the source lies at the origin."""
     rng = streams("rings")
     eddies = [SmoothNoise.draw(streams(f"eddies {axis}")) for axis in "xyz"]
     smoke = WarpedNoise.draw(streams("smoke"), cells=6, octaves=4, gain=0.62)
@@ -55,7 +56,8 @@ def build(parameters: PlumeParameters, streams: Streams) -> Field:
             out, up = np.float32(core) + a * c - b * s, np.float32(y0) + a * s + b * c
         radius = np.float32(source) + np.float32(spread) * np.clip(up, 0, height)
         # Puffs: the source pulsates, so the stem swells where each ring sits.
-        radius = radius * (1 + np.float32(0.25) * np.cos((up - np.float32(heights[0])) * np.float32(2 * np.pi / (0.63 * height / (len(heights) - 1)))))
+        pulse = np.float32(2 * np.pi * (len(heights) - 1) / (0.63 * height))
+        radius = radius * (1 + np.float32(0.25) * np.cos((up - np.float32(heights[0])) * pulse))
         side = np.abs(out) / radius
         lid = (np.float32(height) - up) / np.float32(head)
         body = smoothstep(0.0, 0.9, np.minimum(1.35 - side, np.minimum(lid, up / np.float32(source) + 1)))

@@ -31,8 +31,8 @@ class ShapesParameters(CloudParameters):
     shape: str = choice(SHAPES, "which one")
     height: float = number(0.2, 1.0, "second side over the longest one (ellipsoid, boxes, cylinder, ring of the torus)")
     depth: float = number(0.2, 1.0, "third side over the longest one (ellipsoid, boxes)")
-    softness: float = number(0.0, 0.8, "width of the soft edge over the half of the thinnest side", usual=0.0, usual_share=0.5)
-    tilt: float = number(0.0, 90.0, "rotation about a random axis, in degrees (not the boxes that fill the grid)", usual=0.0, usual_share=0.4)
+    softness: float = number(0.0, 0.8, "width of the soft edge over half of the thinnest side", usual=0.0, usual_share=0.5)
+    tilt: float = number(0.0, 90.0, "degrees of rotation about a random axis (not of boxes that fill the grid)", usual=0.0, usual_share=0.4)
     haze: float = number(0.01, 0.3, "density of the haze, or of the thin end of the gradient", log=True)
 
 
@@ -98,6 +98,7 @@ def _half_sides(shape: str, height: float, depth: float) -> Array:
 
 
 def build(parameters: ShapesParameters, streams: Streams) -> Field:
+    """Density of a simple shape over space; its longest half side is 1."""
     rng = streams("placement")
     height, depth, haze = parameters.height, parameters.depth, parameters.haze
     fills = (True, True, True)

@@ -25,6 +25,7 @@ class StratusParameters(CloudParameters):
 
 
 def build(parameters: StratusParameters, streams: Streams) -> Field:
+    """Density of a layer over space; it is 1 wide and its base lies at y = 0."""
     cells = CellNoise.draw(streams("cells"))
     smooth = SmoothNoise.draw(streams("smooth"))
     fine = SmoothNoise.draw(streams("fine"))
