@@ -12,11 +12,10 @@
 #include <openvdb/math/Maps.h>
 #include <openvdb/openvdb.h>
 #include <openvdb/tools/Dense.h>
+#include <openvdb/util/logging.h>
 
 #include <cstdint>
 #include <fstream>
-#include <limits>
-#include <map>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -132,23 +131,21 @@ private:
     std::vector<Entry> entries_;
 };
 
+// Names and messages may hold bytes that are not UTF-8; they are replaced, never an error.
+nb::str text(const std::string& bytes) {
+    return nb::steal<nb::str>(PyUnicode_DecodeUTF8(bytes.data(), static_cast<Py_ssize_t>(bytes.size()), "replace"));
+}
+
 nb::object metadata_value(const openvdb::Metadata& metadata) {
     if (const auto* m = dynamic_cast<const openvdb::StringMetadata*>(&metadata)) {
-        const std::string& text = m->value();
-        PyObject* decoded = PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "replace");
-        return nb::steal(decoded);
+        return text(m->value());
     }
     if (const auto* m = dynamic_cast<const openvdb::BoolMetadata*>(&metadata)) return nb::cast(m->value());
     if (const auto* m = dynamic_cast<const openvdb::Int32Metadata*>(&metadata)) return nb::cast(m->value());
     if (const auto* m = dynamic_cast<const openvdb::Int64Metadata*>(&metadata)) return nb::cast(m->value());
     if (const auto* m = dynamic_cast<const openvdb::FloatMetadata*>(&metadata)) return nb::cast(m->value());
     if (const auto* m = dynamic_cast<const openvdb::DoubleMetadata*>(&metadata)) return nb::cast(m->value());
-    const std::string text = metadata.str();
-    return nb::steal(PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "replace"));
-}
-
-nb::str text(const std::string& bytes) {
-    return nb::steal<nb::str>(PyUnicode_DecodeUTF8(bytes.data(), static_cast<Py_ssize_t>(bytes.size()), "replace"));
+    return text(metadata.str());
 }
 
 nb::dict header(const Entry& entry) {
@@ -309,18 +306,25 @@ void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndi
 
 NB_MODULE(_openvdb, m) {
     openvdb::initialize();
+    // Its warnings would reach the terminal in colour, past Python's logging; what matters is thrown.
+    openvdb::logging::setLevel(openvdb::logging::Level::Error);
     nb::exception<VdbError>(m, "VdbError", PyExc_RuntimeError);
-    // OpenVDB's own exceptions and those of the stream and of memory, in the order in which they are tried (the last registered first).
+    // This translator is tried before the one that nb::exception registered: the text may hold bytes of a damaged file.
     nb::register_exception_translator(
         [](const std::exception_ptr& thrown, void* type) {
+            const auto raise = [type](const std::string& message) {
+                PyErr_SetObject(static_cast<PyObject*>(type), text(message).ptr());
+            };
             try {
                 std::rethrow_exception(thrown);
+            } catch (const VdbError& error) {
+                raise(error.what());
             } catch (const openvdb::Exception& error) {
-                PyErr_SetString(static_cast<PyObject*>(type), error.what());
+                raise(error.what());
             } catch (const std::ios_base::failure&) {
-                PyErr_SetString(static_cast<PyObject*>(type), "the file ends too early or cannot be read");
+                raise("the file ends too early or cannot be read or written");
             } catch (const std::length_error&) {
-                PyErr_SetString(static_cast<PyObject*>(type), "the file asks for an impossible amount of memory: it is damaged");
+                raise("the file asks for an impossible amount of memory: it is damaged");
             }
         },
         m.attr("VdbError").ptr());
