@@ -12,7 +12,6 @@
 #include <openvdb/math/Maps.h>
 #include <openvdb/openvdb.h>
 #include <openvdb/tools/Dense.h>
-#include <openvdb/util/logging.h>
 
 #include <cstdint>
 #include <fstream>
@@ -306,8 +305,6 @@ void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndi
 
 NB_MODULE(_openvdb, m) {
     openvdb::initialize();
-    // Its warnings would reach the terminal in colour, past Python's logging; what matters is thrown.
-    openvdb::logging::setLevel(openvdb::logging::Level::Error);
     nb::exception<VdbError>(m, "VdbError", PyExc_RuntimeError);
     // This translator is tried before the one that nb::exception registered: the text may hold bytes of a damaged file.
     nb::register_exception_translator(
