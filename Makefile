@@ -9,7 +9,7 @@ CONFIG ?= configs/first.toml
 VENV := .venv
 BIN := $(VENV)/bin
 STAMPS := $(VENV)/stamps
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 DEBIAN := g++ python3-venv python3-dev libopenvdb-dev libboost-iostreams-dev libllvm19
 
 # The editable install knows the modules by name: one more or less asks for it anew (seconds; nothing is compiled).

@@ -137,7 +137,9 @@ def _choose(file: Path, headers: Sequence[_openvdb.Header], grid: str | None) ->
             floats = [i for i in floats if headers[i]["name"] == "density"]
         if len(floats) == 1:
             return floats[0]
-        raise InputError(f"{file}: name the grid to read; there is no single float grid, and no single one called 'density'. Grids: {listing}")
+        raise InputError(
+            f"{file}: name the grid to read; there is no single float grid, and no single one called 'density'. Grids: {listing}"
+        )
     matches = [i for i, h in enumerate(headers) if h["unique_name"] == grid] or [i for i, h in enumerate(headers) if h["name"] == grid]
     if not matches:
         raise InputError(f"{file}: no grid called '{grid}'. Grids: {listing}")

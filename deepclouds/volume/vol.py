@@ -87,7 +87,9 @@ def write_vol(path: str | PathLike[str], volume: Volume) -> None:
     edges = np.diag(volume.to_world)[:3]
     off_axis = volume.to_world[:3, :3] - np.diag(edges)
     if np.any(edges <= 0) or np.abs(off_axis).max() > 1e-7 * edges.max():
-        raise InputError(f"{file}: a .vol file's box is aligned with the world's axes, this volume is rotated or mirrored; write a .vdb file")
+        raise InputError(
+            f"{file}: a .vol file's box is aligned with the world's axes, this volume is rotated or mirrored; write a .vdb file"
+        )
     lower = volume.to_world[:3, 3]
     header = _HEADER.pack(b"VOL", 3, _FLOAT32, *volume.resolution, 1, *lower, *(lower + edges))
     with replacing(file) as temporary, temporary.open("wb") as stream:
