@@ -191,9 +191,7 @@ def _trace(
     interaction.sh_frame = mi.Frame3f(interaction.wi)
     wo, _, _ = medium.phase_function().sample(mi.PhaseFunctionContext(sampler), interaction, sampler.next_1d(), sampler.next_2d())
 
-    ray = dr.zeros(mi.RayDifferential3f, n * walks)
-    ray.o, ray.d = interaction.p, wo
-    ray.maxt = dr.largest(mi.Float)
+    ray = mi.RayDifferential3f(interaction.p, wo)
     radiance, _, _ = scene.integrator().sample(scene, sampler, ray, medium if inside else None)
     values = radiance if mi.is_monochromatic else radiance[0]
     return np.array(values, np.float32).reshape(n, walks)
