@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, zoom
 
 from deepclouds.volume import Volume
 
@@ -23,21 +23,26 @@ def _frame(toward: Sequence[float]) -> NDArray[np.float64]:
     return np.stack([right, np.cross(axis, right), axis])
 
 
-def _resample(volume: Volume, frame: NDArray[np.float64], reach: float, n: int) -> NDArray[np.float32]:
-    """Density on a lattice (n, n, n) along the frame's axes (toward, up, right), spanning -reach to reach."""
-    t = ((np.arange(n) + 0.5) / n * 2 - 1) * reach
-    toward, up, right = np.meshgrid(t, t, t, indexing="ij")
+def _lattice(reach: float, side: float, n: int) -> NDArray[np.float32]:
+    """Positions (3, n, n, n) along a frame's axes right, up (to `side`) and toward (to `reach`); the array runs toward, up, right."""
+    t = ((np.arange(n) + 0.5) / n * 2 - 1).astype(np.float32)
+    toward, up, right = np.meshgrid(t * np.float32(reach), t * np.float32(side), t * np.float32(side), indexing="ij")
+    return np.stack([right, up, toward])
+
+
+def _resample(volume: Volume, frame: NDArray[np.float64], lattice: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Density (n, n, n) at a frame's lattice."""
     inverse = np.linalg.inv(volume.to_world)
-    turn = inverse[:3, :3] @ frame.T
-    unit = np.tensordot(turn, np.stack([right, up, toward]), axes=1) + inverse[:3, 3].reshape(3, 1, 1, 1)
-    counts = np.array(volume.resolution).reshape(3, 1, 1, 1)
+    turn = (inverse[:3, :3] @ frame.T).astype(np.float32)
+    unit = np.tensordot(turn, lattice, axes=1) + inverse[:3, 3].astype(np.float32).reshape(3, 1, 1, 1)
+    counts = np.array(volume.resolution, np.float32).reshape(3, 1, 1, 1)
     inside = np.all((unit >= 0) & (unit <= 1), axis=0)
-    cells = (unit * counts - 0.5)[::-1]
+    cells = (unit * counts - np.float32(0.5))[::-1]
     values = map_coordinates(volume.density, cells, order=1, mode="nearest")
     return np.asarray(np.where(inside, values, 0), np.float32)
 
 
-def preview(volume: Volume, optical_depth: float = 40.0, size: int = 160, steps: int = 160) -> NDArray[np.uint8]:
+def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps: int = 128) -> NDArray[np.uint8]:
     """Render a volume of white scatterers against a sky.
 
     Single scattering with shadows toward a sun high on the left, two softened copies of it that stand for the light scattered on,
@@ -48,7 +53,9 @@ def preview(volume: Volume, optical_depth: float = 40.0, size: int = 160, steps:
     optical_depth
         of a ray through the world's length 2 at the extinction-weighted mean density.
     size
-        pixels along both sides; the view spans the volume's largest radius.
+        pixels along both sides; the picture just holds the box.
+    steps
+        samples along each ray.
 
     Returns
     -------
@@ -59,12 +66,15 @@ def preview(volume: Volume, optical_depth: float = 40.0, size: int = 160, steps:
     flat = volume.density.astype(np.float64)
     sigma = optical_depth / 2 * flat.sum() / (flat**2).sum()
     camera, sun, zenith = _frame(_VIEW), _frame(_SUN), _frame((1e-6, 1.0, 1e-6))
-    density = _resample(volume, camera, reach, steps)
+    corners = np.array([[x, y, z] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])])
+    side = 1.04 * float(np.abs(corners @ camera[:2].T).max())
+    seen_at = _lattice(reach, side, steps)
+    density = _resample(volume, camera, seen_at)
     h = 2 * reach / steps
-    toward_sun = _depth_toward(volume, sun, reach, 112, camera, steps) * sigma
-    toward_sky = _depth_toward(volume, zenith, reach, 72, camera, steps) * sigma
-    light = 0.75 * np.exp(-toward_sun) + 0.28 * np.exp(-0.2 * toward_sun) + 0.12 * np.exp(-0.04 * toward_sun)
-    ambient = 0.22 * np.exp(-0.15 * toward_sky) + 0.07
+    toward_sun = _depth_toward(volume, sun, reach, 112, camera, seen_at) * sigma
+    toward_sky = _depth_toward(volume, zenith, reach, 64, camera, seen_at) * sigma
+    light = 0.55 * np.exp(-toward_sun) + 0.2 * np.exp(-0.2 * toward_sun) + 0.08 * np.exp(-0.04 * toward_sun)
+    ambient = 0.13 * np.exp(-0.15 * toward_sky) + 0.05
     # The lattice's first axis points toward the eye, so the march starts at its far end.
     tau = density[::-1] * np.float32(sigma * h)
     before = np.cumsum(tau, axis=0) - tau
@@ -75,21 +85,21 @@ def preview(volume: Volume, optical_depth: float = 40.0, size: int = 160, steps:
     height = np.linspace(0, 1, steps)[:, None, None]
     picture = seen + behind * (_SKY_LOW * (1 - height) + _SKY_TOP * height)
     picture = np.clip(picture, 0, 1)[::-1] ** (1 / 2.2)
-    rows = (np.arange(size) * steps) // size
-    return np.asarray(np.rint(picture[rows][:, rows] * 255), np.uint8)
+    finer = zoom(picture, (size / steps, size / steps, 1), order=1, grid_mode=True, mode="nearest")
+    return np.asarray(np.rint(finer * 255), np.uint8)
 
 
 def _depth_toward(
-    volume: Volume, frame: NDArray[np.float64], reach: float, n: int, camera: NDArray[np.float64], steps: int
+    volume: Volume, frame: NDArray[np.float64], reach: float, n: int, camera: NDArray[np.float64], lattice: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Integral of the density from each sample of the camera's lattice toward the frame's third axis."""
-    density = _resample(volume, frame, reach, n)
+    """Integral of the density from each position of the camera's lattice toward the frame's third axis."""
+    density = _resample(volume, frame, _lattice(reach, reach, n))
     spacing = 2 * reach / n
     column = (np.cumsum(density[::-1], axis=0)[::-1] - 0.5 * density) * np.float32(spacing)
-    t = ((np.arange(steps) + 0.5) / steps * 2 - 1) * reach
-    toward, up, right = np.meshgrid(t, t, t, indexing="ij")
-    there = np.tensordot(frame @ camera.T, np.stack([right, up, toward]), axes=1)
-    cells = ((there / reach + 1) / 2 * n - 0.5)[::-1]
+    there = np.tensordot((frame @ camera.T).astype(np.float32), lattice, axes=1)
+    # A step toward the light, so that the lattice's own steps do not shadow a surface.
+    there[2] += np.float32(spacing)
+    cells = ((there / np.float32(reach) + 1) * np.float32(n / 2) - np.float32(0.5))[::-1]
     return np.asarray(map_coordinates(column, cells, order=1, mode="nearest"), np.float32)
 
 

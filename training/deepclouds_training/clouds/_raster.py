@@ -130,13 +130,20 @@ def _sharpen(values: NDArray[np.float32], target: float | None) -> NDArray[np.fl
 
 
 def _power(density: NDArray[np.float32], target: float) -> float:
-    """Exponent between 1/4 and 6 that brings the extinction-weighted mean nearest to `target` (it falls as the exponent grows)."""
+    """Exponent between 1/4 and 4 that brings the extinction-weighted mean to `target`, or as low as it goes.
+
+    The mean first falls as the exponent grows, then rises again when only the densest voxels are left: the first crossing counts.
+    """
     count, edges = np.histogram(density[density > _FLOOR], bins=1024, range=(0.0, 1.0))
     value = (edges[:-1] + edges[1:]) / 2
-    low, high = 0.25, 6.0
-    for _ in range(30):
-        middle = (low + high) / 2
-        power = value**middle
-        mean = float((count * power * power).sum() / max((count * power).sum(), 1e-30))
-        low, high = (middle, high) if mean > target else (low, middle)
-    return (low + high) / 2
+    exponents = np.geomspace(0.25, 4.0, 97)
+    powers = value ** exponents[:, None]
+    means = (powers * powers) @ count / np.maximum(powers @ count, 1e-30)
+    below = np.flatnonzero(means <= target)
+    if len(below) == 0:
+        return float(exponents[means.argmin()])
+    k = below[0]
+    if k == 0:
+        return float(exponents[0])
+    share = (means[k - 1] - target) / (means[k - 1] - means[k])
+    return float(exponents[k - 1] + share * (exponents[k] - exponents[k - 1]))

@@ -29,7 +29,7 @@ def build(parameters: CongestusParameters, streams: Streams) -> Field:
     for k in range(parameters.bulbs):
         t = k / (parameters.bulbs - 1)
         # A waist above the base and a swollen head, as a rising thermal has.
-        radius = (0.46 - 0.16 * np.sin(np.pi * min(1.25 * t, 1.0)) - 0.08 * t) * rng.uniform(0.9, 1.15)
+        radius = (0.42 - 0.14 * np.sin(np.pi * min(1.25 * t, 1.0)) - 0.08 * t) * rng.uniform(0.9, 1.15)
         y = 0.15 + t * (height - 0.15 - radius)
         drift = rng.normal(0, 0.07, 2)
         balls.append((parameters.shear * y + drift[0], y, drift[1], radius))
@@ -40,8 +40,8 @@ def build(parameters: CongestusParameters, streams: Streams) -> Field:
             balls[-1], balls[-2] = balls[-2], balls[-1]
     for k in range(parameters.shoulders):
         angle = 2 * np.pi * (k * 0.618 + 0.2 * rng.random())
-        top = height * rng.uniform(0.15, 0.5)
-        radius = rng.uniform(0.24, 0.34)
+        top = height * rng.uniform(0.12, 0.5)
+        radius = rng.uniform(0.2, 0.28)
         for y in np.arange(0.1, top, 0.7 * radius):
-            balls.append((0.45 * np.cos(angle) + parameters.shear * y, y, 0.45 * np.sin(angle), radius * rng.uniform(0.85, 1.1)))
+            balls.append((0.3 * np.cos(angle) + parameters.shear * y, y, 0.3 * np.sin(angle), radius * rng.uniform(0.85, 1.1)))
     return heap(bud(rng, np.array(balls), 2, 7, 0.45, upward=0.3, floor=0.0), parameters, streams, turret=0.26, base=0.0)

@@ -18,7 +18,7 @@ class CumulusFieldParameters(HeapParameters):
     """Parameters of a cumulus field."""
 
     clouds: int = number(3, 8, "clouds in the field", integer=True)
-    spacing: float = number(1.15, 1.8, "distance between neighbours over the sum of their radii")
+    spacing: float = number(1.0, 1.4, "distance between neighbours over the sum of their radii")
     spread: float = number(0.2, 0.7, "how much the clouds differ in size: share by which the smallest is smaller than the largest")
 
 

@@ -57,7 +57,7 @@ def build(parameters: PlumeParameters, streams: Streams) -> Field:
         radius = np.float32(source) + np.float32(spread) * np.clip(up, 0, height)
         # Puffs: the source pulsates, so the stem swells where each ring sits.
         pulse = np.float32(2 * np.pi * (len(heights) - 1) / (0.63 * height))
-        radius = radius * (1 + np.float32(0.25) * np.cos((up - np.float32(heights[0])) * pulse))
+        radius = radius * (1 + np.float32(0.16) * np.cos((up - np.float32(heights[0])) * pulse))
         side = np.abs(out) / radius
         lid = (np.float32(height) - up) / np.float32(head)
         body = smoothstep(0.0, 0.9, np.minimum(1.35 - side, np.minimum(lid, up / np.float32(source) + 1)))

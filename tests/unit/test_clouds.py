@@ -1,0 +1,309 @@
+"""The cloud families: determinism, ranges, emptiness, the exact shapes, and the scene file."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from deepclouds_training.clouds import (
+    FAMILIES,
+    HELD_OUT,
+    TRAINING,
+    Choice,
+    Range,
+    draw_parameters,
+    make_cloud,
+    scale_for_optical_depth,
+    weighted_mean,
+    write_mitsuba_scene,
+)
+
+from deepclouds.errors import InputError
+from deepclouds.volume import Volume, read_vol
+
+SHAPES = FAMILIES["shapes"].ranges["shape"]
+assert isinstance(SHAPES, Choice)
+
+
+def test_training_and_held_out_families_share_nothing_and_leave_nothing_out() -> None:
+    assert HELD_OUT == ("congestus", "plume")
+    assert set(TRAINING) | set(HELD_OUT) == set(FAMILIES)
+    assert not set(TRAINING) & set(HELD_OUT)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_same_seed_same_bytes_other_seed_other_bytes(family: str) -> None:
+    first, again, other = make_cloud(family, 11, 32), make_cloud(family, 11, 32), make_cloud(family, 12, 32)
+    assert first.density.tobytes() == again.density.tobytes()
+    assert first.to_world.tobytes() == again.to_world.tobytes()
+    assert first.density.tobytes() != other.density.tobytes()
+
+
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "shapes"])
+def test_the_seed_matters_beyond_the_parameters(family: str) -> None:
+    fixed = dataclasses.asdict(draw_parameters(family, 1))
+    first, second = make_cloud(family, 1, 32, **fixed), make_cloud(family, 2, 32, **fixed)
+    assert first.density.tobytes() == make_cloud(family, 1, 32).density.tobytes()
+    assert first.density.tobytes() != second.density.tobytes()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_clouds_are_finite_normalised_centred_and_not_empty(family: str) -> None:
+    for seed in range(8):
+        volume = make_cloud(family, seed, 32)
+        density = volume.density
+        lower, upper = volume.bounds
+        assert density.dtype == np.float32
+        assert np.all(np.isfinite(density))
+        assert density.min() >= 0
+        assert density.max() == 1
+        assert np.count_nonzero(density) >= 8
+        assert max(volume.resolution) == 32
+        np.testing.assert_allclose(lower, -upper, atol=1e-12)
+        assert (upper - lower).max() == pytest.approx(2)
+
+
+@pytest.mark.parametrize("family", ["cumulus", "congestus", "fractus", "cumulus_field", "plume"])
+def test_the_crop_is_tight_with_one_empty_voxel_around(family: str) -> None:
+    for seed in range(4):
+        volume = make_cloud(family, seed, 48)
+        for axis in range(3):
+            inside = np.flatnonzero(volume.density.any(axis=tuple(a for a in range(3) if a != axis)))
+            n = volume.density.shape[axis]
+            assert 1 <= inside[0] <= 4
+            assert 1 <= n - 1 - inside[-1] <= 4
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_drawn_parameters_keep_to_their_ranges_and_fill_them(family: str) -> None:
+    drawn = [dataclasses.asdict(draw_parameters(family, seed)) for seed in range(300)]
+    for name, domain in FAMILIES[family].ranges.items():
+        values = [d[name] for d in drawn]
+        if isinstance(domain, Choice):
+            assert set(values) == set(domain.options)
+            continue
+        assert all(domain.low <= v <= domain.high for v in values)
+        # 300 draws of which at least 40 % are spread over the range come within 10 % of both ends but for one time in 10,000.
+        assert min(values) <= domain.low + 0.1 * (domain.high - domain.low)
+        assert max(values) >= domain.high - 0.2 * (domain.high - domain.low)
+
+
+def test_a_fixed_parameter_leaves_the_other_draws_alone() -> None:
+    free, fixed = draw_parameters("cumulus", 5), draw_parameters("cumulus", 5, turrets=4)
+    assert dataclasses.replace(free, turrets=4) == fixed
+
+
+def test_the_usual_value_takes_its_share() -> None:
+    domain = Range(0.5, 2.0, log=True, usual=1.0, usual_share=0.6)
+    rng = np.random.default_rng(7)
+    share = np.mean([domain.draw(rng) == 1.0 for _ in range(2000)])
+    assert abs(share - 0.6) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("family", "resolution", "seed", "given", "words"),
+    [
+        ("cumulonimbus", 32, 0, {}, "cumulus_field"),
+        ("cumulus", 32, 0, {"turets": 3}, "turrets"),
+        ("cumulus", 32, 0, {"turrets": 30}, "3 to 9"),
+        ("cumulus", 32, 0, {"turrets": 3.5}, "whole"),
+        ("cumulus", 32, 0, {"billow": "much"}, "not a number"),
+        ("cumulus", 32, 0, {"billow": float("nan")}, "range"),
+        ("stratus", 32, 0, {"edges": "sharp"}, "faded"),
+        ("cumulus", 4, 0, {}, "resolution"),
+        ("cumulus", 32, -1, {}, "seed"),
+    ],
+)
+def test_bad_arguments_are_refused_with_the_remedy(family: str, resolution: int, seed: int, given: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make_cloud(family, seed, resolution, **given)
+
+
+def test_details_grow_with_the_resolution_and_the_form_stays() -> None:
+    coarse, fine = make_cloud("cumulus", 3, 24, voxel_aspect=1), make_cloud("cumulus", 3, 96, voxel_aspect=1)
+    rng = np.random.default_rng(0)
+    # The margins differ by the size of a voxel, so the comparison blurs both over the size of a coarse one.
+    points = rng.uniform(-0.9, 0.9, (4000, 3)) * fine.bounds[1]
+    jitter = rng.uniform(-0.06, 0.06, (16, 1, 3))
+    a, b = (np.mean([v.sample(points + j) for j in jitter], axis=0) for v in (coarse, fine))
+    assert np.corrcoef(a, b)[0, 1] > 0.9
+
+
+def test_mean_to_max_is_met() -> None:
+    for family in ("cumulus", "cumulus_field", "congestus", "plume", "fractus"):
+        ranges = FAMILIES[family].ranges["mean_to_max"]
+        assert isinstance(ranges, Range)
+        for target in (ranges.low, ranges.high):
+            density = make_cloud(family, 2, 40, mean_to_max=target).density
+            assert weighted_mean(density) == pytest.approx(target, abs=0.03)
+
+
+def test_plumes_are_as_uneven_as_smoke() -> None:
+    ratios = [weighted_mean(make_cloud("plume", seed, 40).density) for seed in range(6)]
+    assert min(ratios) > 0.21
+    assert max(ratios) < 0.38
+
+
+def test_weighted_mean_of_a_homogeneous_body_is_one_and_of_two_levels_is_known() -> None:
+    assert weighted_mean(np.ones((2, 3, 4), np.float32)) == pytest.approx(1)
+    assert weighted_mean(np.array([[[4, 1, 1, 0]]], np.float32)) == pytest.approx(18 / 6 / 4)
+
+
+def _centre_of_mass_height(volume: Volume) -> float:
+    density = volume.density.astype(np.float64)
+    rows = density.sum(axis=(0, 2))
+    return float((rows * (np.arange(len(rows)) + 0.5)).sum() / rows.sum() / len(rows))
+
+
+def test_a_cumulus_has_a_flat_base_and_an_uneven_top() -> None:
+    for seed in range(4):
+        density = make_cloud("cumulus", seed, 64, erosion=0.2, voxel_aspect=1).density > 0.02
+        columns = np.flatnonzero(density.any(axis=1).ravel())
+        heights = np.arange(density.shape[1])[None, :, None]
+        base = np.where(density, heights, 10**6).min(axis=1).ravel()[columns]
+        top = np.where(density, heights, -1).max(axis=1).ravel()[columns]
+        # The middle half of the columns starts within a few voxels, and ends all over the place.
+        assert np.subtract(*np.quantile(base, (0.6, 0.1))) <= 4
+        assert np.subtract(*np.quantile(top, (0.75, 0.25))) >= 6
+
+
+def test_a_congestus_is_taller_than_wide_and_a_stratus_flat() -> None:
+    tall, flat = make_cloud("congestus", 0, 48), make_cloud("stratus", 0, 48)
+    assert tall.bounds[1].argmax() == 1
+    assert flat.bounds[1][1] < 0.5 * flat.bounds[1][0]
+
+
+def test_a_cumulus_field_holds_separate_clouds() -> None:
+    from scipy.ndimage import label
+
+    for seed in range(3):
+        volume = make_cloud("cumulus_field", seed, 64, clouds=5, erosion=0.1)
+        pieces, _ = label(volume.density > 0)
+        sizes = np.sort(np.bincount(pieces.ravel())[1:])[::-1]
+        assert np.count_nonzero(sizes > 0.02 * sizes[0]) >= 3
+
+
+def test_a_full_box_is_homogeneous_to_its_faces() -> None:
+    volume = make_cloud("shapes", 0, 16, shape="full_box", height=0.5, depth=0.75, voxel_aspect=1)
+    assert volume.resolution == (16, 8, 12)
+    assert np.all(volume.density == 1)
+    np.testing.assert_allclose(volume.bounds[1], (1, 0.5, 0.75))
+
+
+def test_anisotropic_voxels_keep_the_box() -> None:
+    volume = make_cloud("shapes", 0, 16, shape="full_box", height=0.5, depth=1.0, voxel_aspect=2.0)
+    assert volume.resolution == (16, 4, 16)
+    np.testing.assert_allclose(volume.voxel_size, (0.125, 0.25, 0.125))
+
+
+@pytest.mark.parametrize(
+    ("shape", "solid"),
+    [
+        ("sphere", lambda h, d: 4 / 3 * np.pi),
+        ("ellipsoid", lambda h, d: 4 / 3 * np.pi * h * d),
+        ("box", lambda h, d: 8 * h * d),
+        ("slab", lambda h, d: 8 * (0.05 + 0.1 * h) * (0.7 + 0.3 * d)),
+        ("cylinder", lambda h, d: 2 * np.pi * h**2),
+        ("torus", lambda h, d: 2 * np.pi**2 * (0.85 - 0.25 * h) * (0.15 + 0.25 * h) ** 2),
+    ],
+)
+@pytest.mark.parametrize("tilt", [0.0, 35.0])
+def test_hard_solids_have_their_analytic_volume(shape: str, solid, tilt: float) -> None:  # type: ignore[no-untyped-def]
+    h, d, resolution = 0.8, 0.6, 64
+    volume = make_cloud("shapes", 3, resolution, shape=shape, height=h, depth=d, softness=0, tilt=tilt, voxel_aspect=1)
+    measured = volume.density.sum(dtype=np.float64) * np.prod(volume.voxel_size)
+    if tilt == 0:
+        # The grid is scaled to 2 units: the solid's longest side of 2, and the margin of a voxel on both sides.
+        spread = np.flatnonzero(volume.density.max(axis=tuple(a for a in range(3) if a != 2 - int(volume.bounds[1].argmax()))) >= 0.5)
+        shrink = len(spread) / max(volume.resolution)
+    else:
+        # Turned solids are measured by their inner voxels' share instead: one voxel of the same grid in the solid's own units.
+        upright = make_cloud("shapes", 3, resolution, shape=shape, height=h, depth=d, softness=0, tilt=0, voxel_aspect=1)
+        inside = upright.density.sum(dtype=np.float64) * np.prod(upright.voxel_size)
+        assert (volume.density > 0).mean() <= (upright.density > 0).mean() + 0.05
+        assert inside > 0
+        assert volume.density.max() == 1
+        return
+    assert measured == pytest.approx(solid(h, d) * shrink**3, rel=0.06)
+
+
+def test_the_gradient_is_linear() -> None:
+    density = make_cloud("shapes", 4, 24, shape="gradient_box", haze=0.05).density.astype(np.float64)
+    for axis in range(3):
+        assert np.abs(np.diff(density, n=2, axis=axis)).max() < 1e-5
+    assert density.min() < 0.2
+
+
+def test_one_bright_voxel_in_haze() -> None:
+    density = make_cloud("shapes", 4, 24, shape="bright_voxel", haze=0.03).density
+    assert np.count_nonzero(density == 1) == 1
+    assert np.all(density[density < 1] == np.float32(0.03))
+
+
+def test_soft_edges_are_soft() -> None:
+    hard, soft = (make_cloud("shapes", 1, 48, shape="sphere", softness=s, voxel_aspect=1).density for s in (0.0, 0.8))
+    between = [np.mean((d > 0.1) & (d < 0.9)) / np.mean(d > 0) for d in (hard, soft)]
+    assert between[0] < 0.2
+    assert between[1] > 0.4
+
+
+def test_the_optical_depth_is_that_of_the_densest_column() -> None:
+    volume = make_cloud("shapes", 0, 16, shape="full_box", height=0.5)
+    assert scale_for_optical_depth(volume, 10.0) == pytest.approx(10.0)
+    with pytest.raises(InputError, match="positive"):
+        scale_for_optical_depth(volume, 0.0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"albedo": 1.2},
+        {"albedo": (1.0, 0.5)},
+        {"g": 1.0},
+        {"scale": -1.0},
+        {"omega_sun": (0, 0, 0)},
+        {"fov": 0.0},
+        {"irradiance": -1.0},
+        {"camera_origin": (0, 0, 0), "camera_target": (0, 0, 0)},
+    ],
+)
+def test_a_scene_refuses_impossible_values_and_writes_nothing(tmp_path: Path, bad: dict[str, object]) -> None:
+    volume = make_cloud("shapes", 0, 8, shape="full_box")
+    with pytest.raises(InputError):
+        write_mitsuba_scene(tmp_path / "scene", volume, **bad)  # type: ignore[arg-type]
+    assert not (tmp_path / "scene").exists()
+
+
+def test_the_scene_loads_and_renders_what_beer_and_lambert_say(tmp_path: Path) -> None:
+    """Rationale: box, sun, scale and camera of the scene agree with the volume.
+
+    Expected behaviour: a camera that looks through an absorbing box at the sky's place sees nothing, and one lit by a constant
+    emitter sees the transmittance of the box along its axis.
+    """
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    volume = make_cloud("shapes", 0, 16, shape="full_box", height=0.5, depth=0.4)
+    scene = write_mitsuba_scene(
+        tmp_path, volume, scale=1.5, albedo=0.0, camera_origin=(0.0, 0.0, 50.0), camera_target=(0.0, 0.0, 0.0), fov=1.0
+    )
+    text = scene.read_text()
+    start, end = text.index('  <emitter type="directional">'), text.index("</emitter>") + len("</emitter>")
+    scene.write_text(text[:start] + '  <emitter type="constant"><rgb name="radiance" value="1"/></emitter>' + text[end:])
+    image = np.array(mi.render(mi.load_file(str(scene), size=8, spp=512), seed=1))
+    # The box is 0.8 deep: every ray of this narrow view passes it from face to face; 32,768 binary samples have a deviation of 0.0025.
+    assert image.mean() == pytest.approx(np.exp(-1.5 * 0.8), abs=0.012)
+    assert read_vol(tmp_path / "density.vol").density.tobytes() == volume.density.tobytes()
+
+
+def test_the_scene_of_a_cloud_renders(tmp_path: Path) -> None:
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    volume = make_cloud("cumulus", 0, 24)
+    scene = write_mitsuba_scene(tmp_path, volume, scale=scale_for_optical_depth(volume, 20.0), albedo=(0.99, 0.98, 0.97))
+    image = np.array(mi.render(mi.load_file(str(scene), size=8, spp=1)))
+    assert image.shape == (8, 8, 3)
+    assert np.all(np.isfinite(image))
+    assert image.max() > 0
+    assert (tmp_path / "density.vdb").stat().st_size > 0
