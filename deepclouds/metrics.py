@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -401,7 +402,7 @@ def student_p(t: ArrayLike, dof: ArrayLike) -> Floats:
     start = np.arctan(t_ / np.sqrt(nu))
     # Beyond start + 14 / sqrt(dof) the integrand has fallen by more than exp(-98): nothing is left there for large dof.
     width = np.minimum(np.pi / 2 - start, 14 / np.sqrt(nu))
-    nodes, weights = np.polynomial.legendre.leggauss(64)
+    nodes, weights = _gauss_points()
     theta = start[..., None] + width[..., None] * (nodes + 1) / 2
     log_norm = np.vectorize(lambda n: math.lgamma((n + 1) / 2) - math.lgamma(n / 2), otypes=[np.float64])(nu) - 0.5 * math.log(math.pi)
     with np.errstate(divide="ignore", under="ignore"):
@@ -410,9 +411,16 @@ def student_p(t: ArrayLike, dof: ArrayLike) -> Floats:
     return p
 
 
+@lru_cache(maxsize=1)
+def _gauss_points() -> tuple[Floats, Floats]:
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    return nodes, weights
+
+
 def _sidak(p: Floats) -> float:
-    smallest = float(p.min())
-    return 1.0 if smallest >= 1 else -math.expm1(p.size * math.log1p(-smallest))
+    # Where both sets are constant and equal (the black around a cloud) nothing was tested, so nothing is corrected for.
+    tested = p[p < 1]
+    return -math.expm1(tested.size * math.log1p(-float(tested.min()))) if tested.size and tested.min() > 0 else float(tested.size == 0)
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:

@@ -1,0 +1,141 @@
+"""One method on one scene in a process of its own, so that each has its own Mitsuba variant, thread pools and cold start.
+
+    python -m benchmarks.worker METHOD scene.xml --size 96 --spp 16,64 --seed 7 --out folder
+
+METHOD is deepclouds, volpath, oidn (volpath and its denoised image) or single (single scattering). Writes one EXR an image and
+`METHOD.json`: for each image its method, spp, file, seconds warm and seconds cold. Warm: scene, kernels and model are loaded, all work
+that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and loading included.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.errors import InputError
+from deepclouds.exr import write_exr
+
+Image = NDArray[np.float32]
+METHODS = ("deepclouds", "volpath", "oidn", "single")
+# The spp that stands for "what the renderer chooses itself".
+DEFAULT_SPP = 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Render, time and write; returns 0."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.worker", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("method", choices=METHODS)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--size", type=int, required=True)
+    parser.add_argument("--spp", required=True, help="comma-separated; 0: the renderer's own default (deepclouds only)")
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--model", help="deepclouds: another model than the released one")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args(argv)
+    spps = [int(s) for s in options.spp.split(",")]
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.method == "deepclouds":
+        rows = render_deepclouds(options.scene, options.size, spps, options.seed, options.out, options.model)
+    else:
+        rows = render_peer(options.method, options.scene, options.size, spps, options.seed, options.out)
+    (options.out / f"{options.method}.json").write_text(json.dumps(rows))
+    return 0
+
+
+def render_deepclouds(scene: Path, size: int, spps: list[int], seed: int, out: Path, model: str | None) -> list[dict[str, Any]]:
+    """Time the runtime: the second call with another seed is the warm one. The clock is ours; only the loading time is its own word."""
+    start = time.perf_counter()
+    runtime: Any = import_module("deepclouds_runtime")
+    imports = time.perf_counter() - start
+    rows = []
+    for index, spp in enumerate(spps):
+        asked = None if spp == DEFAULT_SPP else spp
+        seconds = []
+        for repeat in range(2):
+            start = time.perf_counter()
+            result = runtime.render(str(scene), spp=asked, seed=seed + 2 * index + repeat, defines={"size": str(size)}, model=model)
+            rgb = np.asarray(result.rgb, dtype=np.float32)[..., :3]
+            elapsed = time.perf_counter() - start
+            seconds.append((elapsed, max(0.0, elapsed - result.seconds.get("load", 0.0))))
+        cold = imports + seconds[0][0] if index == 0 else None
+        rows.append(_row("deepclouds", spp, rgb, seconds[1][1], cold, out))
+    return rows
+
+
+def render_peer(method: str, scene: Path, size: int, spps: list[int], seed: int, out: Path) -> list[dict[str, Any]]:
+    """Time Mitsuba's volpath in scalar_rgb, its image denoised, or its first order alone."""
+    start = time.perf_counter()
+    import mitsuba as mi
+
+    mi.set_variant("scalar_rgb")
+    loaded = load_volpath(mi, scene, size, max_depth=2 if method == "single" else -1)
+    denoise: Any = None
+    if method == "oidn":
+        import mitsuba_oidn
+
+        denoise = mitsuba_oidn.denoise
+    loading = time.perf_counter() - start
+
+    def render(spp: int, seed: int) -> Image:
+        return np.ascontiguousarray(np.asarray(mi.render(loaded, spp=spp, seed=seed), dtype=np.float32)[..., :3])
+
+    # The filter's weights are loaded and its memory is set up by the first image of a size.
+    warm_up = render(1, seed)
+    if denoise is not None:
+        denoise(warm_up, hdr=True)
+    rows = []
+    for index, spp in enumerate(spps):
+        start = time.perf_counter()
+        image = render(spp, seed + 1 + index)
+        traced = time.perf_counter() - start
+        rows.append(_row("single" if method == "single" else "volpath", spp, image, traced, loading + traced, out))
+        if denoise is not None:
+            start = time.perf_counter()
+            # A cloud has no albedo or normal at a first surface; both images would be empty. Colour is all the filter gets.
+            clean = np.array(denoise(image, hdr=True), dtype=np.float32)
+            filtered = traced + time.perf_counter() - start
+            rows.append(_row("oidn", spp, clean, filtered, loading + filtered, out))
+    return rows
+
+
+def load_volpath(mi: Any, scene: Path, size: int, max_depth: int) -> Any:
+    """Load a scene with volpath, no roulette and the given depth; the scene's file must take the parameters integrator and size."""
+    try:
+        root = ElementTree.parse(scene).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise InputError(f"{scene}: not a readable scene ({error})") from error
+    integrator = root.find("integrator")
+    if integrator is None:
+        raise InputError(f"{scene}: a benchmark scene needs an <integrator>")
+    for name, value in (("max_depth", max_depth), ("rr_depth", 1_000_000)):
+        entry = next((e for e in integrator if e.get("name") == name), None)
+        if entry is None:
+            entry = ElementTree.SubElement(integrator, "integer", name=name)
+        entry.set("value", str(value))
+    # Text has no folder of its own: relative file names are looked for beside the scene.
+    mi.file_resolver().append(str(scene.parent.resolve()))
+    return mi.load_string(ElementTree.tostring(root, encoding="unicode"), integrator="volpath", size=str(size))
+
+
+def _row(method: str, spp: int, image: Image, warm: float, cold: float | None, out: Path) -> dict[str, Any]:
+    path = out / f"{method}_{spp}.exr"
+    write_exr(path, {c: image[..., i] for i, c in enumerate("RGB")}, {"spp": spp, "seconds": warm})
+    return {"method": method, "spp": spp, "file": path.name, "seconds_warm": warm, "seconds_cold": cold}
+
+
+if __name__ == "__main__":
+    try:
+        raise SystemExit(main())
+    except InputError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(2) from None

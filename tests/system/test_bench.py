@@ -1,0 +1,172 @@
+"""The benchmark's arithmetic, its tables, and one run end to end; no timing decides anything here."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import bench, make_scenes
+from benchmarks.equal_error import Timing, interpolated_seconds, unbiased_seconds
+from deepclouds.errors import InputError
+from deepclouds.exr import read_exr
+from deepclouds.metrics import ErrorReport, error_report
+from deepclouds.volume import read_vol
+
+SCENES = Path(bench.__file__).parent / "scenes"
+
+
+def report(error: float) -> ErrorReport:
+    a = np.random.default_rng(1).normal(1, 1e-6, (24, 24, 1))
+    signs = np.where(np.indices((24, 24)).sum(axis=0) % 2, 1.0, -1.0)[..., None]
+    return error_report(a * (1 + error * signs), a, a)
+
+
+def row(method: str, spp: int, seconds: float, error: float) -> bench.Row:
+    return bench.Row(method, "s", spp, seconds, None, report(error))
+
+
+def test_unbiased_time_is_quadratic() -> None:
+    timings = [Timing(1.0, 0.4), Timing(16.0, 0.1)]
+    assert unbiased_seconds(timings, 0.05).value == pytest.approx(64.0)
+    assert unbiased_seconds(timings, 0.2).value == pytest.approx(4.0)
+    assert unbiased_seconds(timings, 0.2).bound == ""
+
+
+def test_denoised_time_is_interpolated_in_the_logarithm() -> None:
+    timings = [Timing(1.0, 0.16), Timing(100.0, 0.04)]
+    assert interpolated_seconds(timings, 0.08).value == pytest.approx(10.0)
+    assert interpolated_seconds(timings, 0.16).value == pytest.approx(1.0)
+    assert interpolated_seconds(timings, 0.04).value == pytest.approx(100.0)
+    assert interpolated_seconds(timings, 0.04).bound == ""
+
+
+def test_beyond_its_points_the_denoiser_gets_a_bound() -> None:
+    timings = [Timing(1.0, 0.16), Timing(4.0, 0.08), Timing(16.0, 0.09)]
+    worse, better = interpolated_seconds(timings, 0.5), interpolated_seconds(timings, 0.01)
+    assert (worse.value, worse.bound) == (1.0, "<=")
+    # The third point is slower and no better, so nothing is known beyond the second.
+    assert (better.value, better.bound) == (4.0, ">=")
+    assert str(better.over(2.0)) == ">= 2"
+    with pytest.raises(ValueError, match="above 0"):
+        interpolated_seconds(timings, 0.0)
+    with pytest.raises(ValueError, match="at least one"):
+        unbiased_seconds([], 0.1)
+
+
+def test_speed_up_lines() -> None:
+    rows = [row("volpath", 16, 2.0, 0.4), row("oidn", 16, 2.0, 0.05), row("deepclouds", 0, 0.5, 0.1), row("deepclouds", 64, 5.0, 0.09)]
+    (line,) = bench.speed_ups(rows)
+    # volpath: 2 s * (0.4 / 0.1)^2 = 32 s, 64 times 0.5 s. The denoiser is better than we are from its first point on.
+    assert line.startswith("s: deepclouds reaches 10.00 % in 0.5 s; at equal error 64 x [64, 64] against volpath (32 s)")
+    assert "<= 4 x" in line
+    assert bench.speed_ups(rows[:2]) == ["s: no speed-up, deepclouds was not run"]
+    table = bench.markdown(rows)
+    assert "32 s (64 x)" in table
+    assert "| default |" in table
+    assert len(table.splitlines()) == 2 + len(rows)
+
+
+def test_results_replace_only_what_lies_between_the_marks(tmp_path: Path) -> None:
+    page = tmp_path / "benchmark.md"
+    page.write_text("before\n" + "\n\nold figures\n\n".join(bench._MARKS) + "\nafter\n")
+    (tmp_path / "images").mkdir()
+    rows = [row("volpath", 16, 2.0, 0.4), row("deepclouds", 0, 0.5, 0.1)]
+    for _ in range(2):
+        bench.write_docs(rows, bench.markdown(rows), tmp_path)
+        text = page.read_text()
+        assert text.startswith("before\n" + bench._MARKS[0])
+        assert text.endswith(bench._MARKS[1] + "\nafter\n")
+        assert "old figures" not in text
+        assert text.count("| s | volpath |") == 1
+    page.write_text("no marks")
+    with pytest.raises(InputError, match="once each"):
+        bench.write_docs(rows, "", tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(make_scenes.RECIPES))
+def test_our_scenes_are_what_their_recipe_makes(name: str, tmp_path: Path) -> None:
+    """Expected behaviour: a recipe writes the very volume and scene that are in the repository; references exist, differ and agree."""
+    assert make_scenes.main(["--out", str(tmp_path), "--only", name, "--no-references"]) == 0
+    fresh, kept = (read_vol(folder / name / "density.vol").density for folder in (tmp_path, SCENES))
+    # Sums of sines and exponentials may differ in the last bit between machines.
+    np.testing.assert_allclose(fresh, kept, atol=1e-6)
+    assert (tmp_path / name / "scene.xml").read_text() == (SCENES / name / "scene.xml").read_text()
+    assert 0 < kept.mean() < kept.max() == pytest.approx(1.0)
+    assert all(np.all(face == 0) for axis in range(3) for face in (kept.take(0, axis), kept.take(-1, axis)))
+    assert all(f.stat().st_size < 400_000 for f in (SCENES / name).iterdir())
+    a, b = (read_exr(SCENES / name / f"ref_{x}.exr") for x in "ab")
+    record = json.loads((SCENES / name / "ref.json").read_text())
+    assert a.attributes["spp"] == b.attributes["spp"] == record["spp_each"]
+    assert a.attributes["firstSeed"] != b.attributes["firstSeed"]
+    between = error_report(a.rgb(), b.rgb())
+    # Independent noise: neither the same image nor another picture.
+    assert 0.005 < between.rrmse < 0.4
+    assert abs(between.energy) < 0.03
+
+
+def test_scenes_are_looked_up_by_name(tmp_path: Path) -> None:
+    assert [p.name for p in bench.find_scenes(SCENES, "plume_sky,heap_sun")] == ["plume_sky", "heap_sun"]
+    with pytest.raises(InputError, match="no scene nowhere"):
+        bench.find_scenes(SCENES, "nowhere")
+    with pytest.raises(InputError, match="no scene; a scene is"):
+        bench.find_scenes(tmp_path, None)
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "scene.xml").write_text("<scene/>")
+    with pytest.raises(InputError, match=r"ref_a\.exr: missing"):
+        bench.find_scenes(tmp_path, None)
+    with pytest.raises(InputError, match="unknown magic"):
+        bench.main(["--methods", "magic"])
+    with pytest.raises(InputError, match=r"--spp 0"):
+        bench.main(["--spp", "0"])
+    with pytest.raises(InputError, match="not a multiple"):
+        bench.main(["--size", "50", "--out", str(tmp_path / "out")])
+
+
+@pytest.mark.slow
+def test_peers_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Expected behaviour: volpath is unbiased and gets better with samples, denoising helps, single scattering lacks energy."""
+    pytest.importorskip("mitsuba")
+    pytest.importorskip("mitsuba_oidn")
+    code = bench.main(
+        ["--only", "ball_isotropic", "--methods", "volpath,oidn,single", "--spp", "4,32", "--size", "48", "--out", str(tmp_path)]
+    )
+    assert code == 0
+    with open(tmp_path / "bench.csv", newline="", encoding="utf-8") as file:
+        rows = {(r["method"], r["spp"]): r for r in csv.DictReader(file)}
+    assert set(rows) == {(m, s) for m in ("volpath", "oidn", "single") for s in ("4", "32")}
+    error = {key: float(r["rrmse"]) for key, r in rows.items()}
+    assert error["volpath", "4"] / error["volpath", "32"] == pytest.approx(math.sqrt(8), rel=0.25)
+    assert error["oidn", "4"] < 0.5 * error["volpath", "4"]
+    assert abs(float(rows["volpath", "32"]["energy"])) < 0.05
+    assert float(rows["single", "32"]["energy"]) < -0.4
+    assert all(float(r["seconds_warm"]) > 0 and float(r["seconds_cold"]) > float(r["seconds_warm"]) for r in rows.values())
+    assert capsys.readouterr().out.strip().endswith("ball_isotropic: no speed-up, deepclouds was not run")
+    assert (tmp_path / "bench.md").is_file()
+
+
+def test_a_method_that_fails_is_named_and_the_rest_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(*arguments: object) -> str:
+        return "ModuleNotFoundError: nothing here"
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(bench, "run_worker", fail)
+    try:
+        assert bench.main(["--only", "ball_isotropic", "--quick", "--out", str(tmp_path)]) == 1
+    finally:
+        patch.undo()
+    out = capsys.readouterr().out.strip().splitlines()
+    assert sum("did not run: ModuleNotFoundError" in line for line in out) == 3
+    assert out[-1] == "ball_isotropic: no speed-up, deepclouds was not run" or "did not run" in out[-1]
+
+
+def test_a_worker_reports_its_last_complaint(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text("<scene version='3.0.0'></scene>")
+    pytest.importorskip("mitsuba")
+    problem = bench.run_worker("volpath", tmp_path / "scene.xml", 8, [1], 1, tmp_path, None)
+    assert problem is not None
+    assert "needs an <integrator>" in problem
