@@ -3,6 +3,8 @@
 
 #include <openvdb/openvdb.h>
 
+#include <limits>
+
 using namespace openvdb;
 
 static FloatGrid::Ptr fog(const std::string& name, float background = 0.0f) {
@@ -66,6 +68,12 @@ int main() {
         save("level_set.vdb", {grid});
     }
     save("empty.vdb", {fog("density")});
+    {
+        FloatGrid::Ptr grid = fog("density");
+        const float values[] = {2.0f, -1.0f, std::numeric_limits<float>::quiet_NaN(), -3.0f, 1.0f};
+        for (int i = 0; i < 5; ++i) grid->tree().setValue({i, 0, 0}, values[i]);
+        save("no_density.vdb", {grid});
+    }
     // Rotated, non-uniform, translated; stored with 16 bits.
     {
         FloatGrid::Ptr grid = fog("density");

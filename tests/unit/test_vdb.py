@@ -1,0 +1,230 @@
+"""OpenVDB files: against files that OpenVDB wrote without us (data/make_fixtures.cpp), there and back, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepclouds.errors import InputError
+from deepclouds.volume import Volume, _openvdb, list_grids, read_vdb, read_vol, write_vdb
+
+DATA = Path(__file__).parent / "data"
+
+
+def world(volume: Volume, indices: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """World positions of the centres of the samples (i, j, k)."""
+    unit = (indices + 0.5) / np.array(volume.resolution)
+    return np.asarray(unit @ volume.to_world[:3, :3].T + volume.to_world[:3, 3])
+
+
+def test_active_tiles_are_read_and_counted() -> None:
+    """Rationale: a reader that knows only leaves loses the inside of every cloud."""
+    (grid,) = list_grids(DATA / "tiles.vdb")
+    assert (grid.name, grid.value_type, grid.grid_class) == ("density", "float", "fog volume")
+    assert grid.active_voxels == 24 * 16 * 40 + 1
+    assert grid.index_box == ((-3, 0, 0), (23, 15, 50))
+    assert grid.voxel_size == (0.5, 0.5, 0.5)
+    volume = read_vdb(DATA / "tiles.vdb")
+    expected = np.zeros((51, 16, 27), np.float32)
+    expected[:40, :, 3:] = 3.0
+    expected[50, 5, 0] = 0.25
+    np.testing.assert_array_equal(volume.density, expected)
+    # Voxel centres are integers times the voxel size, the box reaches half a voxel further.
+    lower, upper = volume.bounds
+    np.testing.assert_allclose(lower, (-1.75, -0.25, -0.25))
+    np.testing.assert_allclose(upper, (11.75, 7.75, 25.25))
+
+
+def test_rotated_non_uniform_half_grid_keeps_its_place() -> None:
+    """Expected: the value that make_fixtures.cpp stores at index (i, j, k) is found at the world position of that index."""
+    (grid,) = list_grids(DATA / "rotated.vdb")
+    assert grid.half
+    np.testing.assert_allclose(grid.voxel_size, (0.5, 1.0, 2.0))
+    assert grid.index_to_world is not None
+    c, s = np.cos(0.5), np.sin(0.5)
+    expected = [[0.5 * c, -s, 0, 10], [0.5 * s, c, 0, 20], [0, 0, 2, 30], [0, 0, 0, 1]]
+    np.testing.assert_allclose(grid.index_to_world, expected, atol=1e-12)
+    volume = read_vdb(DATA / "rotated.vdb")
+    for i, j, k in np.ndindex(3, 2, 4):
+        stored = 1.0 + i + 10.0 * j + 100.0 * k
+        centre = grid.index_to_world[:3, :3] @ (i + 5, j - 2, k + 1) + grid.index_to_world[:3, 3]
+        assert volume.sample(centre[None])[0] == pytest.approx(stored, rel=1e-6)
+
+
+def test_a_grid_is_chosen_by_name() -> None:
+    several = DATA / "several.vdb"
+    names = [g.unique_name for g in list_grids(several)]
+    assert names == ["flames", "heat", "twin[0]", "twin[1]", "shared", "wind", "label"]
+    assert [g.value_type for g in list_grids(several)] == ["float"] * 5 + ["vec3s", "int32"]
+    assert read_vdb(several, "heat").density.item() == 2.0
+    assert read_vdb(several, "twin[1]").density.item() == 4.0
+    with pytest.raises(InputError, match=r"name the grid to read.*flames.*wind"):
+        read_vdb(several)
+    with pytest.raises(InputError, match="2 grids are called 'twin'"):
+        read_vdb(several, "twin")
+    with pytest.raises(InputError, match=r"no grid called 'smoke'.*flames"):
+        read_vdb(several, "smoke")
+    with pytest.raises(InputError, match="'wind' holds vec3s"):
+        read_vdb(several, "wind")
+
+
+def test_a_grid_that_shares_its_voxels_has_its_own_place() -> None:
+    flames, shared = read_vdb(DATA / "several.vdb", "flames"), read_vdb(DATA / "several.vdb", "shared")
+    assert flames.density.item() == shared.density.item() == 1.0
+    np.testing.assert_allclose(flames.bounds[0], (0.5, 1.5, 2.5))
+    np.testing.assert_allclose(shared.bounds[0], (1.0, 3.0, 5.0))
+
+
+def test_an_unknown_grid_type_does_not_hide_the_others() -> None:
+    odd, density = list_grids(DATA / "unknown_type.vdb")
+    assert (odd.name, odd.value_type, odd.index_to_world) == ("odd", "Tree_float_5_4_2", None)
+    assert density.active_voxels == 1
+    assert read_vdb(DATA / "unknown_type.vdb").density.item() == 7.0
+    with pytest.raises(InputError, match="Tree_float_5_4_2"):
+        read_vdb(DATA / "unknown_type.vdb", "odd")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("frustum.vdb", "NonlinearFrustumMap.*not affine"),
+        ("level_set.vdb", "level set"),
+        ("background.vdb", "background value 0.5"),
+        ("empty.vdb", "no active voxel"),
+    ],
+)
+def test_refuses_what_is_no_fog_volume(name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        read_vdb(DATA / name)
+    assert name in str(error.value)
+    assert len(list_grids(DATA / name)) == 1
+
+
+def test_refuses_folders_missing_and_foreign_files(tmp_path: Path) -> None:
+    for read in (read_vdb, list_grids):
+        with pytest.raises(InputError, match="folder"):
+            read(tmp_path)
+        with pytest.raises(InputError, match="no such file"):
+            read(tmp_path / "none.vdb")
+        (tmp_path / "text.vdb").write_text("this is not a volume, though it is long enough to have a header of some kind")
+        with pytest.raises(InputError, match="not a readable OpenVDB file"):
+            read(tmp_path / "text.vdb")
+
+
+@pytest.mark.parametrize("name", ["tiles.vdb", "several.vdb"])
+def test_every_truncation_is_noticed(tmp_path: Path, name: str) -> None:
+    """Rationale: OpenVDB itself reads zeros beyond the end of a file."""
+    whole = (DATA / name).read_bytes()
+    file = tmp_path / name
+    for length in np.linspace(0, len(whole) - 1, 40).astype(int):
+        file.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=str(file)):
+            list_grids(file)
+
+
+def test_flipped_bytes_never_end_the_process(tmp_path: Path) -> None:
+    """Expected: either the damage is noticed, or only values have changed and a volume comes out."""
+    write_vdb(tmp_path / "a.vdb", Volume.from_box(np.random.default_rng(5).uniform(1, 2, (9, 10, 11)), (0, 0, 0), (1, 1, 1)))
+    whole = (tmp_path / "a.vdb").read_bytes()
+    rng = np.random.default_rng(6)
+    noticed = 0
+    for position in rng.integers(0, min(len(whole), 2000), 60):
+        damaged = bytearray(whole)
+        damaged[position] ^= int(rng.integers(1, 256))
+        (tmp_path / "b.vdb").write_bytes(damaged)
+        try:
+            read_vdb(tmp_path / "b.vdb", clamp=True)
+        except InputError:
+            noticed += 1
+    assert noticed > 0
+
+
+def test_a_changed_voxel_count_is_noticed(tmp_path: Path) -> None:
+    """Rationale: the writer's own count is the only witness of voxels lost on the way."""
+    content = (DATA / "tiles.vdb").read_bytes()
+    count = (15361).to_bytes(8, "little")
+    assert content.count(count) == 1
+    (tmp_path / "a.vdb").write_bytes(content.replace(count, (15360).to_bytes(8, "little")))
+    with pytest.raises(InputError, match="should have 15360 active voxels and has 15361"):
+        read_vdb(tmp_path / "a.vdb")
+
+
+@pytest.mark.parametrize("prune", [True, False])
+def test_written_grids_come_back_cropped_to_what_is_not_zero(tmp_path: Path, prune: bool) -> None:
+    density = np.zeros((40, 30, 20), np.float32)
+    density[5:33, 4:26, 1:18] = 1.5
+    density[7, 8, 9] = 0.125
+    volume = Volume.from_box(density, (0, 0, 0), (20, 30, 40))
+    write_vdb(tmp_path / "a.vdb", volume, prune=prune)
+    again = read_vdb(tmp_path / "a.vdb")
+    np.testing.assert_array_equal(again.density, density[5:33, 4:26, 1:18])
+    np.testing.assert_allclose(np.concatenate(again.bounds), (1, 4, 5, 18, 26, 33), atol=1e-12)
+    (grid,) = list_grids(tmp_path / "a.vdb")
+    assert grid.active_voxels == np.count_nonzero(density) == grid.metadata["file_voxel_count"]
+
+
+def test_pruning_makes_tiles_and_smaller_files(tmp_path: Path) -> None:
+    volume = Volume.from_box(np.ones((64, 64, 64)), (0, 0, 0), (1, 1, 1))
+    sizes = {}
+    for prune in (True, False):
+        write_vdb(tmp_path / "a.vdb", volume, prune=prune)
+        sizes[prune] = (tmp_path / "a.vdb").stat().st_size
+        np.testing.assert_array_equal(read_vdb(tmp_path / "a.vdb").density, volume.density)
+    assert sizes[True] < sizes[False] / 2
+
+
+def test_sheared_transform_name_metadata_and_half(tmp_path: Path) -> None:
+    density = np.random.default_rng(8).uniform(0.5, 3, (4, 5, 6)).astype(np.float32)
+    to_world = np.array([[2, 0.3, 0, 1], [0.1, 3, 0.2, -5], [0, 0.4, 1, 7], [0, 0, 0, 1]], np.float64)
+    metadata: dict[str, str | int | float | bool] = {"author": "Zoë", "steps": 12, "scale": 0.5, "moist": True}
+    write_vdb(tmp_path / "a.vdb", Volume(density, to_world), name="fog", half=True, metadata=metadata)
+    (grid,) = list_grids(tmp_path / "a.vdb")
+    assert grid.name == "fog"
+    assert grid.half
+    assert {key: grid.metadata[key] for key in metadata} == metadata
+    again = read_vdb(tmp_path / "a.vdb", "fog")
+    np.testing.assert_allclose(again.to_world, to_world, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(again.density, density.astype(np.float16).astype(np.float32))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.vdb"]
+
+
+def test_refuses_to_write_what_cannot_be_kept(tmp_path: Path) -> None:
+    large = Volume.from_box(np.full((1, 1, 1), 7e4), (0, 0, 0), (1, 1, 1))
+    with pytest.raises(InputError, match="16 bits"):
+        write_vdb(tmp_path / "a.vdb", large, half=True)
+    with pytest.raises(InputError, match="metadata class"):
+        write_vdb(tmp_path / "a.vdb", large, metadata={"class": "level set"})
+    with pytest.raises(InputError, match="does not exist"):
+        write_vdb(tmp_path / "none" / "a.vdb", large)
+    assert not list(tmp_path.iterdir())
+
+
+def test_negative_values_and_nan_are_counted_or_clamped(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"2 negative values and 1 NaN among 5 voxels; .*--clamp"):
+        read_vdb(DATA / "no_density.vdb")
+    np.testing.assert_array_equal(read_vdb(DATA / "no_density.vdb", clamp=True).density.ravel(), [2, 0, 0, 0, 1])
+    infinite = np.array([[[2.0, np.inf]]], np.float32)
+    _openvdb.write_dense(str(tmp_path / "b.vdb"), infinite, np.eye(4), "density", False, True, {})
+    with pytest.raises(InputError, match="1 infinite"):
+        read_vdb(tmp_path / "b.vdb", clamp=True)
+
+
+def test_two_far_flung_voxels_do_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepclouds.volume.vdb.MAX_VOXELS", 1000)
+    shutil.copy(DATA / "tiles.vdb", tmp_path / "a.vdb")
+    with pytest.raises(InputError, match="27 x 16 x 51 voxels, more than the 1000"):
+        read_vdb(tmp_path / "a.vdb")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["smoke", "wdas_sixteenth"])
+def test_public_volumes_agree_with_their_vol_twins(public_scenes: Path, name: str) -> None:
+    """Expected: the .vol file holds the .vdb file's positive part with one empty voxel around it, in the unit cube."""
+    vdb = read_vdb(public_scenes / "volumes" / f"{name}.vdb", clamp=True).density
+    vol = read_vol(public_scenes / "volumes" / f"{name}.vol").density
+    box = [slice(int(hit.min()), int(hit.max()) + 1) for hit in np.nonzero(vol)]
+    positive = [slice(int(hit.min()), int(hit.max()) + 1) for hit in np.nonzero(vdb)]
+    np.testing.assert_array_equal(vol[tuple(box)], vdb[tuple(positive)])
