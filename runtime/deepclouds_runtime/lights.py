@@ -1,0 +1,166 @@
+"""Environments as light sources: directions drawn in proportion to what arrives from them, weighted exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds_runtime._mitsuba import channels, mitsuba, plain
+
+# Cells of the table never drawn would bias the image where the table misses a light between its samples.
+_UNIFORM_SHARE = 0.02
+_MAX_WIDTH = 2048
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+class Environment:
+    """Radiance from all around, with a table of directions to draw from.
+
+    The table only guides: a drawn direction is weighted by its true radiance over its density, so that the table's resolution changes
+    the noise and never the mean.
+
+    Parameters
+    ----------
+    types
+        Dr.Jit types.
+    radiance
+        callable: unit vectors pointing AWAY from the scene -> list of one float array a colour channel.
+    power
+        (rows, columns) relative importance per solid angle, not negative, on a latitude-longitude grid: row 0 at the pole +Y of
+        the table's frame, column position u at the direction (sin(2 pi u), ., -cos(2 pi u)).
+    frame
+        3 x 3 rotation from the table's frame to the world.
+    """
+
+    def __init__(
+        self,
+        types: ModuleType,
+        radiance: Callable[[Any], list[Any]],
+        power: NDArray[np.floating[Any]],
+        frame: NDArray[np.floating[Any]] | None = None,
+    ) -> None:
+        self.types = types
+        self.radiance = radiance
+        self._frame = np.eye(3) if frame is None else np.asarray(frame, np.float64)
+        rows, columns = power.shape
+        edges = np.cos(np.linspace(0, np.pi, rows + 1))
+        weight = np.asarray(power, np.float64) * (edges[:-1] - edges[1:])[:, None]
+        total = weight.sum()
+        solid = np.broadcast_to((edges[:-1] - edges[1:])[:, None], weight.shape)
+        uniform = solid / solid.sum()
+        weight = (1 - _UNIFORM_SHARE) * weight / total + _UNIFORM_SHARE * uniform if total > 0 else uniform
+        # Cumulative sums a row and a column keep their digits where one sum over all cells would not.
+        by_row = _cumulative(weight.sum(axis=1)[None])[0]
+        by_column = _cumulative(weight)
+        self._rows, self._columns = rows, columns
+        self._row_sums = types.Float(by_row.ravel())
+        self._column_sums = types.Float(by_column.ravel())
+        self._edges = types.Float(edges.astype(np.float32))
+        self._shape = dr.opaque(types.UInt32, rows), dr.opaque(types.UInt32, columns)
+
+    def sample(self, u: Any, v: Any) -> tuple[Any, Any]:
+        """Directions toward the environment, and their densities per steradian, from numbers `u`, `v` in [0, 1)."""
+        t = self.types
+        n_rows, n_columns = self._shape
+        row, low, high = self._find(self._row_sums, t.UInt32(0), n_rows, u)
+        offset = row * (n_columns + 1)
+        column, left, right = self._find(self._column_sums, offset, n_columns, v)
+        probability = (high - low) * (right - left)
+        upper, lower = dr.gather(t.Float, self._edges, row), dr.gather(t.Float, self._edges, row + 1)
+        up = dr.fma((u - low) / (high - low), lower - upper, upper)
+        across = (t.Float(column) + dr.clip((v - left) / (right - left), 0, 1)) / t.Float(n_columns)
+        density = probability * t.Float(n_columns) / (2 * dr.pi * (upper - lower))
+        sine, (s, c) = dr.safe_sqrt(1 - up * up), dr.sincos(2 * dr.pi * across)
+        return self._to_world(sine * s, up, -sine * c), density
+
+    def density(self, direction: Any) -> Any:
+        """Density per steradian with which `sample` draws these directions."""
+        t = self.types
+        n_rows, n_columns = self._shape
+        m = self._frame
+        x, y, z = (direction.x * float(m[0, i]) + direction.y * float(m[1, i]) + direction.z * float(m[2, i]) for i in range(3))
+        theta = dr.acos(dr.clip(y, -1, 1))
+        row = dr.minimum(t.UInt32(theta * (1 / dr.pi) * t.Float(n_rows)), n_rows - 1)
+        u = dr.atan2(x, -z) * (0.5 / dr.pi)
+        u = u - dr.floor(u)
+        column = dr.minimum(t.UInt32(u * t.Float(n_columns)), n_columns - 1)
+        offset = row * (n_columns + 1) + column
+        probability = (dr.gather(t.Float, self._row_sums, row + 1) - dr.gather(t.Float, self._row_sums, row)) * (
+            dr.gather(t.Float, self._column_sums, offset + 1) - dr.gather(t.Float, self._column_sums, offset)
+        )
+        upper, lower = dr.gather(t.Float, self._edges, row), dr.gather(t.Float, self._edges, row + 1)
+        return probability * t.Float(n_columns) / (2 * dr.pi * (upper - lower))
+
+    def _find(self, sums: Any, offset: Any, count: Any, u: Any) -> tuple[Any, Any, Any]:
+        """Index of the interval of a cumulative sum that holds `u`, and the interval's ends."""
+        t = self.types
+        index = dr.binary_search(t.UInt32(0), count, lambda i: dr.gather(t.Float, sums, offset + i + 1) <= u)
+        index = dr.minimum(index, count - 1)
+        return index, dr.gather(t.Float, sums, offset + index), dr.gather(t.Float, sums, offset + index + 1)
+
+    def _to_world(self, x: Any, y: Any, z: Any) -> Any:
+        m = self._frame
+        return dr.normalize(self.types.Array3f(*(x * float(r[0]) + y * float(r[1]) + z * float(r[2]) for r in m)))
+
+
+def _cumulative(weight: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Cumulative sums (rows, columns + 1) from 0 to exactly 1; a row without any weight becomes uniform."""
+    rows, columns = weight.shape
+    total = weight.sum(axis=1, keepdims=True)
+    share = np.where(total > 0, weight / np.where(total > 0, total, 1), 1 / columns)
+    sums = np.concatenate([np.zeros((rows, 1)), np.cumsum(share, axis=1)], axis=1)
+    sums[:, -1] = 1
+    return sums.astype(np.float32)
+
+
+def mitsuba_radiance(types: ModuleType, emitter: Any) -> Callable[[Any], list[Any]]:
+    """What a Mitsuba environment emitter sends from given directions: a callable as `Environment` needs it."""
+    mi = mitsuba()
+
+    def radiance(direction: Any) -> list[Any]:
+        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        interaction.wi = mi.Vector3f(-direction)
+        return channels(types, emitter.eval(interaction))
+
+    return radiance
+
+
+def environment(types: ModuleType, emitter: Any) -> Environment:
+    """The `envmap` or `constant` emitter of a Mitsuba scene as a light source."""
+    mi = mitsuba()
+    radiance = mitsuba_radiance(types, emitter)
+    frame = np.array(emitter.world_transform().matrix, np.float64).reshape(4, 4)[:3, :3]
+    frame = frame / np.linalg.norm(frame, axis=0)
+    parameters = mi.traverse(emitter)
+    if "data" not in parameters:
+        return Environment(types, radiance, np.ones((1, 1)), frame)
+    map_rows, map_columns = np.array(parameters["data"]).shape[:2]
+    columns = int(min(_MAX_WIDTH, max(64, map_columns)))
+    rows = max(columns // 2, 32)
+    return Environment(types, radiance, _table(types, radiance, frame, rows, columns, max(2, -(-2 * map_rows // rows))), frame)
+
+
+def _table(
+    types: ModuleType, radiance: Callable[[Any], list[Any]], frame: NDArray[np.float64], rows: int, columns: int, parts: int
+) -> NDArray[np.float64]:
+    """Mean luminance of every cell, from `parts` x `parts` directions in each."""
+    total = np.zeros((rows, columns))
+    for part in np.ndindex(parts, parts):
+        theta = (np.arange(rows) + (part[0] + 0.5) / parts)[:, None] / rows * np.pi
+        phi = (np.arange(columns) + (part[1] + 0.5) / parts)[None, :] / columns * 2 * np.pi
+        local = np.stack(np.broadcast_arrays(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)), axis=-1)
+        world = (local.reshape(-1, 3) @ frame.T).astype(np.float32)
+        values = radiance(types.Array3f(*(types.Float(np.ascontiguousarray(world[:, c])) for c in range(3))))
+        weights = _LUMINANCE if len(values) == 3 else (1.0,)
+        total += sum(w * np.maximum(np.array(v + dr.zeros(types.Float, len(world))), 0) for w, v in zip(weights, values, strict=True)).reshape(
+            rows, columns
+        )
+    return total / parts**2
+
+
+__all__ = ["Environment", "environment", "mitsuba_radiance", "plain"]

@@ -1,0 +1,127 @@
+"""Where J comes from: the network in a render, Monte Carlo walks as its oracle in tests."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.descriptor import LEVELS, POINTS, Descriptor
+from deepclouds.medium.field import Field
+from deepclouds.medium.multiple_scattering import trace_walks
+from deepclouds.model import aux_inputs
+
+# Stencils are 9 kB each: a chunk of them stays below 100 MB.
+_CHUNK = 8192
+
+
+class MultipleScattering(Protocol):
+    """Source of ``j = 4 pi J / (albedo^2 E)``."""
+
+    def __call__(self, points: Any, w: Any, omega_sun: Any, g: float, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+        """Dimensionless j (n, albedos).
+
+        Parameters
+        ----------
+        points, w, omega_sun
+            Array3f: world points, unit directions of the camera rays' travel, unit vectors TOWARD the light.
+        g
+            Henyey-Greenstein parameter.
+        albedos
+            the DIFFERENT albedos among the colour channels.
+        tau
+            Float: optical depth from the points toward the light.
+        """
+        ...
+
+
+class Predicts(Protocol):
+    """The one thing we ask of a network: see `deepclouds_runtime.predictor.Predictor`."""
+
+    def predict(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Map stencils (n, 10, 225) and auxiliary inputs (n, 6) to j (n,)."""
+        ...
+
+
+class NetworkScattering:
+    """J from the network: a stencil a point, one evaluation for each different albedo.
+
+    Parameters
+    ----------
+    field
+        the extinction.
+    predictor
+        the network.
+    unit, origin
+        see `deepclouds.descriptor.Descriptor`; fixed for a sequence of frames.
+    """
+
+    def __init__(self, field: Field, predictor: Predicts, unit: float | None = None, origin: NDArray[np.float64] | None = None) -> None:
+        self.descriptor = Descriptor(field, unit, origin)
+        self.predictor = predictor
+        self._types = field.types
+
+    def __call__(self, points: Any, w: Any, omega_sun: Any, g: float, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+        """J of the points; see `MultipleScattering`."""
+        # The arc cosine of a float32 cosine loses half of its digits near 0 and pi; the cross product keeps them.
+        gamma = np.array(dr.atan2(dr.norm(dr.cross(w, omega_sun)), dr.dot(w, omega_sun)))
+        depth = np.array(tau)
+        n = len(gamma)
+        result = np.empty((n, len(albedos)), np.float32)
+        if self.descriptor.empty:
+            result[:] = 0
+            return result
+        for start in range(0, n, _CHUNK):
+            stop = min(start + _CHUNK, n)
+            part = [_slice(self._types, v, start, stop) for v in (points, w, omega_sun)]
+            stencil = np.array(self.descriptor.stencils(*part), copy=False).reshape(-1, LEVELS, POINTS)
+            for m, albedo in enumerate(albedos):
+                aux = aux_inputs(gamma[start:stop], g, 0.0, 1.0, albedo, depth[start:stop])
+                result[start:stop, m] = self.predictor.predict(stencil, aux)
+        return result
+
+
+class WalkScattering:
+    """J from Monte Carlo walks: unbiased and noisy, the oracle that a network is held against.
+
+    Parameters
+    ----------
+    field
+        the extinction.
+    walks
+        walks a query.
+    seed
+        root of the random streams; every call continues with streams of its own.
+    """
+
+    def __init__(self, field: Field, walks: int = 1, seed: int = 0) -> None:
+        self._field, self._walks = field, walks
+        self._streams = np.random.SeedSequence(seed)
+
+    def __call__(self, points: Any, w: Any, omega_sun: Any, g: float, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+        """J of the points; see `MultipleScattering`."""
+        x, d, suns = (np.array(v).T.astype(np.float32) for v in (points, w, omega_sun))
+        n = len(x)
+        seed = int(self._streams.spawn(1)[0].generate_state(1, np.uint64)[0])
+        values = trace_walks(
+            self._field,
+            x,
+            d,
+            np.full(n, g, np.float32),
+            np.broadcast_to(suns, (n, 3))[:, None, :],
+            np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos))),
+            self._walks,
+            seed,
+        )
+        mean: NDArray[np.float32] = values.mean(axis=1)[:, 0, :]
+        return mean
+
+
+def _slice(types: ModuleType, vector: Any, start: int, stop: int) -> Any:
+    if dr.width(vector) == 1:
+        return vector
+    index = dr.arange(types.UInt32, stop - start) + dr.opaque(types.UInt32, start)
+    return types.Array3f(*(dr.gather(types.Float, c, index) if dr.width(c) > 1 else c for c in vector))

@@ -1,0 +1,359 @@
+"""Reads a loaded Mitsuba scene: one cloud, its lights, the surfaces around it, and the camera; refuses by name what we cannot render."""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.errors import InputError
+from deepclouds.volume import Volume
+from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
+from deepclouds_runtime.placement import box_transform, cube_transform, locate
+
+_LOG = logging.getLogger(__name__)
+_PHASES = {"HGPhaseFunction": "hg", "IsotropicPhaseFunction": "isotropic"}
+_ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
+_UNLIMITED = 0xFFFFFFFF
+# A homogeneous ball becomes a grid of this many voxels a side, each filled by the share of it that lies inside.
+_BALL_VOXELS = 96
+
+
+@dataclass(frozen=True)
+class Sun:
+    """A distant light: unit vector `omega_sun` TOWARD it and its irradiance perpendicular to it, one value a colour channel."""
+
+    omega_sun: tuple[float, float, float]
+    irradiance: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CloudScene:
+    """What the light transport needs of a scene.
+
+    Parameters
+    ----------
+    volume
+        density and its place.
+    scale
+        extinction per unit of density, 1 / world length.
+    albedo
+        single-scattering albedo, one value a colour channel.
+    g
+        Henyey-Greenstein parameter.
+    suns
+        directional lights.
+    environment
+        Mitsuba's `envmap` or `constant` emitter, or None.
+    surfaces
+        Mitsuba scene of the real surfaces alone, without the containers of the medium; None when there are none.
+    sensor
+        the Mitsuba camera.
+    hide_emitters
+        whether the camera sees black in place of the environment.
+    max_depth
+        -1 for all orders of scattering, 2 for single scattering alone.
+    notes
+        what was approximated in reading, in sentences.
+    """
+
+    volume: Volume
+    scale: float
+    albedo: tuple[float, ...]
+    g: float
+    suns: tuple[Sun, ...]
+    environment: Any
+    surfaces: Any
+    sensor: Any
+    hide_emitters: bool = False
+    max_depth: int = -1
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        width, height = self.sensor.film().size()
+        return int(width), int(height)
+
+
+def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_emitters: bool | None = None) -> CloudScene:
+    """Read a Mitsuba scene that was loaded in one of our variants.
+
+    Parameters
+    ----------
+    scene
+        ``mitsuba.Scene``.
+    sensor
+        index of the camera, or the camera itself.
+    max_depth, hide_emitters
+        override those of the scene's own integrator.
+
+    Raises
+    ------
+    InputError
+        for everything outside of what we render: more or less than one cloud, chromatic extinction, varying albedo, phase functions other
+        than `hg` and `isotropic`, emitters other than `directional`, `constant` and `envmap`, cameras other than `perspective`, crop
+        windows, path lengths other than -1 and 2, surfaces that let light through.
+    """
+    notes: list[str] = []
+    camera = _camera(scene, sensor, notes)
+    containers, surfaces = _split_shapes(scene)
+    if len(containers) != 1:
+        found = "no shape has an interior medium" if not containers else f"{len(containers)} shapes have an interior medium"
+        raise InputError(f"{found}; deepclouds renders scenes with exactly one cloud: a shape with a null BSDF and a medium inside")
+    volume, scale, albedo, g = _read_medium(containers[0])
+    suns, environment = _read_lights(scene)
+    integrator = scene.integrator()
+    if max_depth is None:
+        max_depth = _integrator_depth(integrator)
+    if hide_emitters is None:
+        hide_emitters = bool(getattr(integrator, "hide_emitters", False))
+    return CloudScene(
+        volume, scale, albedo, g, suns, environment, surfaces_alone(surfaces), camera, hide_emitters, check_depth(max_depth), tuple(notes)
+    )
+
+
+def check_depth(max_depth: int) -> int:
+    """Return -1 (all orders) or 2 (single scattering), the two path lengths we render; raises InputError for others."""
+    depth = -1 if max_depth == _UNLIMITED else int(max_depth)
+    if depth not in (-1, 2):
+        raise InputError(f"max_depth = {depth}: deepclouds renders all orders of scattering (-1) or single scattering alone (2)")
+    return depth
+
+
+def _integrator_depth(integrator: Any) -> int:
+    if integrator is None:
+        return -1
+    depth = getattr(integrator, "max_depth", None)
+    if depth is None:
+        match = re.search(r"max_depth = (\d+)", str(integrator))
+        depth = int(match.group(1)) if match else -1
+    return int(depth)
+
+
+def _camera(scene: Any, sensor: Any, notes: list[str]) -> Any:
+    if isinstance(sensor, int):
+        sensors = scene.sensors()
+        if not 0 <= sensor < len(sensors):
+            raise InputError(f"sensor {sensor}: the scene has {len(sensors)} sensors, counted from 0")
+        sensor = sensors[sensor]
+    if sensor.class_name() != "PerspectiveCamera":
+        raise InputError(f"sensor {sensor.class_name()}: deepclouds renders the `perspective` sensor only")
+    film = sensor.film()
+    if tuple(film.crop_size()) != tuple(film.size()):
+        raise InputError(f"film: a crop window of {tuple(film.crop_size())} in {tuple(film.size())}: render the whole image and crop it afterwards")
+    if film.class_name() != "HDRFilm":
+        raise InputError(f"film {film.class_name()}: deepclouds renders into `hdrfilm` only")
+    if film.rfilter().class_name() != "BoxFilter":
+        notes.append(f"the pixel filter {film.rfilter().class_name()} is replaced by a box")
+        _LOG.info(notes[-1])
+    return sensor
+
+
+def _split_shapes(scene: Any) -> tuple[list[Any], list[Any]]:
+    """Containers (a medium inside, nothing to see outside) and surfaces; shapes that neither hold nor show anything are left out."""
+    mi = mitsuba()
+    containers, surfaces = [], []
+    for shape in scene.shapes():
+        name = f"shape '{shape.id()}' ({shape.class_name()})"
+        bsdf = shape.bsdf()
+        if shape.is_emitter():
+            raise InputError(f"{name} is an area light; the lights we know are `directional`, `constant` and `envmap`")
+        null = bsdf is None or bsdf.class_name() == "Null"
+        if shape.interior_medium() is not None:
+            if not null:
+                raise InputError(f"{name} has a medium inside and the BSDF {bsdf.class_name()}; the cloud's container needs the BSDF `null`")
+            containers.append(shape)
+        elif null:
+            continue
+        else:
+            flags = bsdf.flags()
+            if mi.has_flag(flags, mi.BSDFFlags.Null) or mi.has_flag(flags, mi.BSDFFlags.Transmission):
+                raise InputError(f"{name} has the BSDF {bsdf.class_name()}, which lets light through; surfaces around the cloud must be opaque")
+            surfaces.append(shape)
+    return containers, surfaces
+
+
+def surfaces_alone(surfaces: list[Any]) -> Any:
+    """Mitsuba scene of `surfaces`, or None without any: rays in it do not meet the medium's container."""
+    if not surfaces:
+        return None
+    return mitsuba().load_dict({"type": "scene", **{f"surface{i}": shape for i, shape in enumerate(surfaces)}})
+
+
+def _read_lights(scene: Any) -> tuple[tuple[Sun, ...], Any]:
+    mi = mitsuba()
+    suns: list[Sun] = []
+    environment = None
+    for emitter in scene.emitters():
+        kind = emitter.class_name()
+        if kind == "DirectionalEmitter":
+            sample, irradiance = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
+            x, y, z = (float(sample.d[c][0]) for c in range(3))
+            suns.append(Sun((x, y, z), tuple(float(irradiance[c][0]) for c in range(len(irradiance)))))
+        elif kind in _ENVIRONMENTS:
+            environment = emitter
+        else:
+            raise InputError(f"emitter '{emitter.id()}' ({kind}): the lights we know are `directional`, `constant` and `envmap`")
+    return tuple(suns), environment
+
+
+def _read_medium(container: Any) -> tuple[Volume, float, tuple[float, ...], float]:
+    mi = mitsuba()
+    medium = container.interior_medium()
+    kind = medium.class_name()
+    if kind not in ("HeterogeneousMedium", "HomogeneousMedium"):
+        raise InputError(f"medium {kind}: deepclouds renders `heterogeneous` and `homogeneous` media")
+    g = _read_phase(medium.phase_function())
+    parameters = mi.traverse(medium)
+    scale = float(np.ravel(parameters["scale"])[0]) if "scale" in parameters else 1.0
+    if "sigma_t.data" in parameters:
+        data = np.array(parameters["sigma_t.data"])
+        if data.ndim == 4 and data.shape[3] != 1:
+            raise InputError(f"the medium's grid has {data.shape[3]} channels: chromatic extinction; use one channel")
+        density = np.ascontiguousarray(data.reshape(data.shape[:3]), np.float32)
+        try:
+            Volume.from_box(density, np.zeros(3), np.ones(3))
+        except InputError as error:
+            raise InputError(f"the medium's grid: {error}") from error
+        volume = locate(density, scale, _grid_boxes(container, medium), lambda p: _coefficients(medium, p)[1])
+        _check_cover(container, volume)
+    else:
+        volume, scale = _homogeneous(container, medium)
+    return volume, scale, _read_albedo(medium, parameters, volume), g
+
+
+def _read_phase(phase: Any) -> float:
+    kind = phase.class_name()
+    if kind not in _PHASES:
+        raise InputError(f"phase function {kind}: deepclouds renders `hg` and `isotropic`")
+    if _PHASES[kind] == "isotropic":
+        return 0.0
+    return float(np.ravel(mitsuba().traverse(phase)["g"])[0])
+
+
+def _coefficients(medium: Any, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Scattering coefficient (n, channels) and extinction (n,) of a Mitsuba medium at world points (n, 3)."""
+    mi = mitsuba()
+    interaction = dr.zeros(mi.MediumInteraction3f, len(points))
+    interaction.p = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
+    interaction.medium = mi.MediumPtr(medium)
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction)
+    n = len(points)
+    scattering, extinction = (np.stack([np.broadcast_to(np.array(v[c]), n) for c in range(len(v))], axis=-1) for v in (sigma_s, sigma_t))
+    if np.ptp(extinction, axis=-1).max() > 1e-5 * np.abs(extinction).max():
+        raise InputError("the medium's extinction differs between colours; use a grey sigma_t and put the colour into the albedo")
+    return scattering, extinction[:, 0]
+
+
+def _container_cube(container: Any) -> NDArray[np.float64] | None:
+    if container.class_name() != "Cube":
+        return None
+    mi = mitsuba()
+    vertices = [np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3) for shape in (container, mi.load_dict({"type": "cube"}))]
+    return cube_transform(*vertices)
+
+
+def _grid_boxes(container: Any, medium: Any) -> list[NDArray[np.float64]]:
+    """Candidate boxes of the grid: the medium's own bounds, then the container's."""
+    mi, boxes = mitsuba(), []
+    bounds = container.bbox()
+    lower, upper = np.array(bounds.min, np.float64), np.array(bounds.max, np.float64)
+    # The medium tells its world-aligned bounds only to rays: one along each axis, through the middle of the container.
+    reach, middle = 4 * float((upper - lower).max()), 0.5 * (lower + upper)
+    low, high = np.zeros(3), np.zeros(3)
+    for axis in range(3):
+        origin, direction = middle.copy(), np.zeros(3)
+        direction[axis] = 1
+        origin[axis] -= reach
+        hit, near, far = medium.intersect_aabb(mi.Ray3f(mi.Point3f(*origin.tolist()), mi.Vector3f(*direction.tolist())))
+        if not bool(dr.all(hit)):
+            break
+        low[axis], high[axis] = origin[axis] + float(near[0]), origin[axis] + float(far[0])
+    else:
+        snapped_low = np.where(np.abs(low - lower) < 1e-5 * reach, lower, low)
+        snapped_high = np.where(np.abs(high - upper) < 1e-5 * reach, upper, high)
+        boxes.append(box_transform(snapped_low, snapped_high))
+    cube = _container_cube(container)
+    if cube is not None:
+        boxes.append(cube)
+    return boxes
+
+
+def _check_cover(container: Any, volume: Volume) -> None:
+    """The container must not cut the cloud: all filled voxels lie inside."""
+    filled = np.argwhere(volume.density > 0)[:, ::-1]
+    if not len(filled):
+        return
+    shape = np.array(volume.resolution)
+    # Interpolation carries a voxel's value over to its neighbours' centres, but not beyond the box.
+    corners = np.concatenate([np.clip(filled + offset, 0, shape) for offset in np.ndindex(2, 2, 2)]) / shape
+    world = corners @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
+    extent = float(np.ptp(world, axis=0).max())
+    cube = _container_cube(container)
+    if cube is not None:
+        unit = (world - cube[:3, 3]) @ np.linalg.inv(cube[:3, :3]).T
+        outside = np.any((unit < -1e-4) | (unit > 1 + 1e-4), axis=1)
+    elif container.class_name() == "Sphere":
+        center, radius = _ball(container)
+        outside = np.linalg.norm(world - center, axis=1) > radius + 1e-4 * extent
+    else:
+        raise InputError(f"the cloud's container is a {container.class_name()}; use a `cube` (or a `sphere`) around the grid")
+    if outside.any():
+        raise InputError(
+            f"the container ({container.class_name()}) cuts the cloud: {100 * outside.mean():.2g} % of its filled voxels reach outside; "
+            "use a cube of the grid's size"
+        )
+
+
+def _ball(sphere: Any) -> tuple[NDArray[np.float64], float]:
+    bounds = sphere.bbox()
+    lower, upper = np.array(bounds.min, np.float64), np.array(bounds.max, np.float64)
+    return 0.5 * (lower + upper), 0.5 * float((upper - lower).max())
+
+
+def _homogeneous(container: Any, medium: Any) -> tuple[Volume, float]:
+    """Fill the container's inside with a constant: one voxel for a cube, an antialiased ball for a sphere."""
+    bounds = container.bbox()
+    middle = 0.5 * (np.array(bounds.min, np.float64) + np.array(bounds.max, np.float64))
+    sigma_t = float(_coefficients(medium, middle[None])[1][0])
+    cube = _container_cube(container)
+    if cube is not None:
+        return Volume(np.ones((1, 1, 1), np.float32), cube), sigma_t
+    if container.class_name() == "Sphere":
+        center, radius = _ball(container)
+        n = _BALL_VOXELS
+        # Distance of each voxel's centre from the surface, in voxels: a linear ramp one voxel wide is the share inside, nearly.
+        c = (np.arange(n) + 0.5) / n * 2 - 1
+        z, y, x = np.meshgrid(c, c, c, indexing="ij")
+        share = np.clip(0.5 + (1 - np.sqrt(x * x + y * y + z * z)) * n / 2, 0, 1)
+        return Volume.from_box(share.astype(np.float32), center - radius, center + radius), sigma_t
+    raise InputError(f"a homogeneous medium in a {container.class_name()}: deepclouds fills a `cube` or a `sphere`")
+
+
+def _read_albedo(medium: Any, parameters: Any, volume: Volume) -> tuple[float, ...]:
+    names = [name for name in parameters.keys() if name.startswith("albedo")]
+    if any(name.endswith(".data") for name in names):
+        raise InputError("the medium's albedo varies in space (a gridvolume); use one colour")
+    channels = len(mitsuba().Spectrum())
+    for name in names:
+        value = np.ravel(np.array(parameters[name])).astype(np.float64)
+        if value.size in (1, channels):
+            return tuple(float(v) for v in np.broadcast_to(value, channels))
+    raise InputError("the medium's albedo has no constant value; use <rgb name='albedo' .../> or a float")
+
+
+def types_for_scene() -> Any:
+    """Dr.Jit types of Mitsuba's current variant."""
+    return types_of(mitsuba())
+
+
+def camera_origin(sensor: Any) -> Any:
+    """World position of the camera's pinhole, as a plain array."""
+    types = types_for_scene()
+    return plain(types, sensor.world_transform().translation())

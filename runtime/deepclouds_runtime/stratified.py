@@ -1,0 +1,69 @@
+"""Random numbers of a pixel's samples: well spread within the pixel, independent from pixel to pixel, given by a seed."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+# Fractional parts of the square roots of primes (Richtmyer 1951), as 32-bit fixed-point steps, so that long sequences keep their digits;
+# the first two are the powers of the plastic number instead, the best spread for pairs.
+_STEPS = tuple(
+    int(round((value % 1.0) * 2**32)) for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29]))
+)
+PIXEL_X, PIXEL_Y, MARCH, LIGHT_U, LIGHT_V, PHASE_U, PHASE_V, SURFACE_U, SURFACE_V, SURFACE_W, SHADOW, ROULETTE = range(len(_STEPS))
+DEPTH = len(_STEPS)
+_DIMENSIONS = DEPTH + 1
+
+
+class Stratified:
+    """Numbers in [0, 1) for the samples of pixels.
+
+    Within a pixel, dimension `d` of sample `i` is ``frac(i * step_d + r)`` with a random shift ``r`` of the pixel and the dimension: each
+    number is uniform, and those of a pixel are evenly spread (Cranley and Patterson 1976). `DEPTH` is stratified outright,
+    ``(i + r) / count``.
+
+    Parameters
+    ----------
+    types
+        Dr.Jit types.
+    pixel, sample
+        number of the pixel, and of the sample within it, of every lane.
+    count
+        samples of a pixel.
+    seed
+        32 bits; another seed gives independent shifts.
+    """
+
+    def __init__(self, types: ModuleType, pixel: Any, sample: Any, count: Any, seed: Any) -> None:
+        self._types, self._pixel, self._sample, self._count, self._seed = types, pixel, sample, count, seed
+
+    def number(self, dimension: int, part: int = 0, parts: int = 1) -> Any:
+        """The number of `dimension`; `part` of `parts` numbers of each sample that continue the same sequence."""
+        u32 = self._types.UInt32
+        shift = _hash(u32, self._pixel ^ _hash(u32, self._seed + u32(0x9E3779B9) * (dimension + 1)))
+        if dimension == DEPTH:
+            return (self._types.Float(self._sample) + _unit(self._types, shift)) / self._types.Float(self._count)
+        index = self._sample * parts + part
+        return _unit(self._types, index * u32(_STEPS[dimension]) + shift)
+
+    def take(self, lanes: Any) -> Stratified:
+        """The same numbers for the lanes with these indices only."""
+        import drjit as dr
+
+        gather = self._types.UInt32
+        return Stratified(
+            self._types, dr.gather(gather, self._pixel, lanes), dr.gather(gather, self._sample, lanes), self._count, self._seed
+        )
+
+
+def _unit(types: ModuleType, bits: Any) -> Any:
+    return types.Float(bits >> 8) * (1.0 / 16777216.0)
+
+
+def _hash(u32: Any, value: Any) -> Any:
+    """Permute 32 bits so that neighbours become unrelated (the output function of PCG, O'Neill 2014, after one step)."""
+    state = value * u32(747796405) + u32(2891336453)
+    word = ((state >> ((state >> 28) + 4)) ^ state) * u32(277803737)
+    return (word >> 22) ^ word

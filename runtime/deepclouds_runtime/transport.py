@@ -1,0 +1,224 @@
+"""Light at a sample of the cloud: the collision along a ray, single scattering there, and multiple scattering from the network.
+
+    L = int T sigma_t (S1 + J) dt,   estimated by   (1 - exp(-tau)) (S1 + J)   at one point drawn from T sigma_t
+
+The optical depth and the point are found by a deterministic march, so all noise left is that of the point's position and of the
+directions drawn from environments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from deepclouds.medium.field import Field
+from deepclouds.medium.optical_depth import distance_at, optical_depth
+from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
+from deepclouds_runtime import stratified
+from deepclouds_runtime._mitsuba import mitsuba, plain
+from deepclouds_runtime.lights import Environment
+from deepclouds_runtime.scattering import MultipleScattering
+from deepclouds_runtime.scene import Sun
+from deepclouds_runtime.stratified import Stratified
+
+# A sample that hides less than this of what is behind it is sent to the network with a probability in proportion, weighted up.
+_ROULETTE = 0.02
+# The march toward a light goes on beyond `optical_depth`'s limit, for the network is told the whole depth.
+_DEEP = 1e6
+
+
+@dataclass
+class Counts:
+    """How much work a render did."""
+
+    camera_samples: int = 0
+    cloud_samples: int = 0
+    queries: int = 0
+    skipped: int = 0
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The medium as the transport sees it.
+
+    Parameters
+    ----------
+    field
+        extinction.
+    albedo
+        single-scattering albedo, one value a colour channel.
+    g
+        Henyey-Greenstein parameter.
+    scattering
+        source of J, or None for single scattering alone.
+    """
+
+    field: Field
+    albedo: tuple[float, ...]
+    g: float
+    scattering: MultipleScattering | None
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Every light of a scene: suns, environments with the number of directions drawn from each a sample, and what casts shadows.
+
+    Parameters
+    ----------
+    suns
+        directional lights.
+    environments
+        pairs of an environment and how many directions a sample draws from it.
+    surfaces
+        Mitsuba scene of the opaque surfaces, or None.
+    """
+
+    suns: tuple[Sun, ...] = ()
+    environments: tuple[tuple[Environment, int], ...] = ()
+    surfaces: Any = None
+
+    def visible(self, types: ModuleType, points: Any, directions: Any) -> Any:
+        """Whether no surface stands between the points and what lies in these directions."""
+        if self.surfaces is None:
+            return types.Bool(True)
+        mi = mitsuba()
+        ray = mi.Ray3f(mi.Point3f(points), mi.Vector3f(directions))
+        return ~plain(types, self.surfaces.ray_test(ray))
+
+
+@dataclass
+class CloudLight:
+    """What the cloud adds along rays, lane by lane; colours as one array a channel."""
+
+    opacity: Any
+    transmittance: Any
+    distance: Any
+    direct: list[Any] = field(default_factory=list)
+    indirect: list[Any] = field(default_factory=list)
+
+
+def opacity_of(tau: Any) -> Any:
+    """Return ``1 - exp(-tau)`` with full precision for thin media."""
+    return dr.select(tau < 1e-2, tau * (1 - tau * (0.5 - tau * (1 / 6))), 1 - dr.exp(-tau))
+
+
+def depth_of(hidden: Any) -> Any:
+    """Return ``-log(1 - hidden)``, the inverse of `opacity_of`."""
+    return dr.select(hidden < 1e-2, hidden * (1 + hidden * (0.5 + hidden * (1 / 3))), -dr.log(dr.maximum(1 - hidden, 1e-30)))
+
+
+def cloud_light(
+    cloud: Cloud, lights: Lights, origin: Any, direction: Any, end: Any, numbers: Stratified, counts: Counts, active: Any = True
+) -> CloudLight:
+    """Light that the cloud sends back along rays, and what it hides.
+
+    Parameters
+    ----------
+    cloud, lights
+        the medium and what lights it.
+    origin, direction
+        Array3f: world points and unit vectors of the rays.
+    end
+        Float: the rays end here, world units.
+    numbers
+        random numbers of the lanes.
+    counts
+        is updated.
+    active
+        lanes that carry a ray.
+    """
+    types, medium = cloud.field.types, cloud.field
+    n = dr.width(origin, direction, end)
+    jitter = numbers.number(stratified.MARCH)
+    tau = optical_depth(medium, origin, direction, types.Float(0), end, jitter, types.Bool(active))
+    opacity = opacity_of(tau)
+    target = depth_of(numbers.number(stratified.DEPTH) * opacity)
+    distance, _ = distance_at(medium, origin, direction, types.Float(0), end, jitter, target, tau > 0)
+    result = CloudLight(opacity, dr.exp(-tau), distance)
+    channel_count = len(cloud.albedo)
+    result.direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
+    result.indirect = [dr.zeros(types.Float, n) for _ in range(channel_count)]
+    dr.eval(result.opacity, result.transmittance, result.distance, origin, direction)
+    lanes = dr.compress(result.opacity > 0)
+    counts.cloud_samples += len(lanes)
+    if len(lanes) == 0 or not any(a > 0 for a in cloud.albedo):
+        return result
+    take = _taker(types, lanes)
+    d = take(direction)
+    points = dr.fma(d, take(distance), take(origin))
+    _scatter(cloud, lights, points, d, take(opacity), numbers.take(lanes), counts, lanes, result)
+    return result
+
+
+def _taker(types: ModuleType, lanes: Any) -> Any:
+    def take(value: Any) -> Any:
+        if dr.depth_v(value) > 1:
+            return types.Array3f(*(take(c) for c in value))
+        return value if dr.width(value) == 1 else dr.gather(type(value), value, lanes)
+
+    return take
+
+
+def _scatter(
+    cloud: Cloud, lights: Lights, points: Any, w: Any, opacity: Any, numbers: Stratified, counts: Counts, lanes: Any, result: CloudLight
+) -> None:
+    """Add single and multiple scattering at `points` to the lanes of `result`, for every light."""
+    types, medium = cloud.field.types, cloud.field
+    channel_count = len(cloud.albedo)
+    albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
+    g = dr.opaque(types.Float, cloud.g)
+    direct = [dr.zeros(types.Float, len(lanes)) for _ in range(channel_count)]
+    jitter = numbers.number(stratified.SHADOW)
+    # Which samples are worth a query is the same for all lights: one that lies in a thin place is so for each of them.
+    keep = dr.minimum(opacity * (1 / _ROULETTE), 1)
+    asked = numbers.number(stratified.ROULETTE) < keep
+    queries = dr.compress(asked) if cloud.scattering is not None else types.UInt32()
+    weight = dr.gather(types.Float, opacity / keep, queries)
+    take = _taker(types, queries)
+    target = dr.gather(types.UInt32, lanes, queries)
+
+    def light(omega: Any, radiance: list[Any], share: Any) -> None:
+        """One direction: `radiance` is what arrives over the density of the direction (the irradiance, of a sun)."""
+        tau = optical_depth(medium, points, omega, types.Float(0), dr.largest(types.Float), jitter, types.Bool(True), _DEEP)
+        seen = lights.visible(types, points, omega)
+        single = dr.select(seen, hg(dr.dot(w, omega), g) * dr.exp(-tau), 0) * share
+        for c in range(channel_count):
+            direct[c] += albedo[c] * radiance[c] * single
+        dr.eval(tau, direct)
+        if cloud.scattering is not None and len(queries):
+            different = tuple(sorted(set(cloud.albedo)))
+            counts.queries += len(queries) * len(different)
+            counts.skipped += (len(lanes) - len(queries)) * len(different)
+            j = cloud.scattering(take(points), take(w), take(omega), cloud.g, different, take(tau))
+            for c in range(channel_count):
+                value = types.Float(np.ascontiguousarray(j[:, different.index(cloud.albedo[c])]))
+                value = value * (albedo[c] * albedo[c] * (0.25 / dr.pi)) * weight * take(radiance[c])
+                dr.scatter_add(result.indirect[c], value, target)
+
+    for sun in lights.suns:
+        omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
+        light(omega, [dr.opaque(types.Float, e) for e in sun.irradiance], 1)
+    for environment, directions in lights.environments:
+        for k in range(directions):
+            omega, density = environment.sample(
+                numbers.number(stratified.LIGHT_U, k, directions), numbers.number(stratified.LIGHT_V, k, directions)
+            )
+            phase_density = hg(dr.dot(w, omega), g)
+            radiance = [v / (density * directions) for v in environment.radiance(omega)]
+            light(omega, radiance, density / (density + phase_density))
+            # The other half of the pair: a direction from the phase function, which finds what a smooth sky hides from the table.
+            cosine = sample_hg_cosine(numbers.number(stratified.PHASE_U, k, directions), g)
+            omega = rotate_to(w, cosine, 2 * dr.pi * numbers.number(stratified.PHASE_V, k, directions))
+            phase_density = hg(cosine, g)
+            tau = optical_depth(medium, points, omega, types.Float(0), dr.largest(types.Float), jitter, types.Bool(True))
+            share = phase_density / (phase_density + environment.density(omega)) * (1.0 / directions)
+            share = dr.select(lights.visible(types, points, omega), share * dr.exp(-tau), 0)
+            for c, value in enumerate(environment.radiance(omega)):
+                direct[c] += albedo[c] * value * share
+            dr.eval(direct)
+    for c in range(channel_count):
+        dr.scatter(result.direct[c], direct[c] * opacity, lanes)
