@@ -1,0 +1,204 @@
+"""The radiance-predicting network: one residual block a level of the stencil, from the coarsest to the finest.
+
+After Kallweit et al. 2017, "Deep Scattering" (ACM TOG 36(6), section 4). Departures: the coarse scales come first, the angle enters as
+features that resolve the phase peak, the phase function and the albedo are inputs, and the head is an exponential.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deepclouds.model import LEVELS, POINTS
+
+ORDERS = (1, 2, 4, 8)
+FEATURES = 6 + len(ORDERS) + 3
+LOWEST, HIGHEST = -14.0, 6.0
+STENCIL_LIMIT = 1e4
+TAU_LIMIT = 1e6
+G_LIMIT = 0.999
+
+
+class NetworkConfig(BaseModel):
+    """Shape of the network.
+
+    Attributes
+    ----------
+    width
+        hidden units of every layer.
+    order
+        which end of the scales the blocks start from.
+    scale
+        what enters the logarithm: ``depth``, the optical depth across one spacing of the level (stencil times 2^level), or
+        ``density``, the stencil value itself.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: int = Field(default=128, ge=8, le=1024)
+    order: Literal["coarse_first", "fine_first"] = "coarse_first"
+    scale: Literal["depth", "density"] = "depth"
+
+
+class AngleFeatures(nn.Module):
+    """Features of angle, phase function, albedo and optical depth, each of order 1, from the contract's ``aux`` rows.
+
+    Light that has scattered n times in a forward peak still follows the n-fold convolution of the phase function: for one
+    Henyey-Greenstein lobe that is the lobe with g^n, for two lobes a binomial mixture of lobes with g1^i g2^(n - i). Their logarithms at
+    gamma resolve a peak that the raw angle cannot.
+    """
+
+    degrees_1: Tensor
+    degrees_2: Tensor
+    binomials: Tensor
+    groups: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        terms = [(n, i) for n in ORDERS for i in range(n + 1)]
+        self.register_buffer("degrees_1", torch.tensor([i for _, i in terms]), persistent=False)
+        self.register_buffer("degrees_2", torch.tensor([n - i for n, i in terms]), persistent=False)
+        self.register_buffer("binomials", torch.tensor([float(math.comb(n, i)) for n, i in terms]), persistent=False)
+        groups = torch.tensor([[float(n == order) for order in ORDERS] for n, _ in terms])
+        self.register_buffer("groups", groups, persistent=False)
+
+    def forward(self, aux: Tensor) -> Tensor:
+        """Features (n, `FEATURES`) of rows (n, 6); inputs beyond their physical range are clamped."""
+        gamma, g1, g2, weight, albedo, log1p_tau = torch.split(aux, 1, dim=1)
+        gamma = torch.clamp(gamma, 0.0, math.pi)
+        g1, g2 = torch.clamp(g1, -G_LIMIT, G_LIMIT), torch.clamp(g2, -G_LIMIT, G_LIMIT)
+        weight, albedo = torch.clamp(weight, 0.0, 1.0), torch.clamp(albedo, 0.0, 1.0)
+        log1p_tau = torch.clamp(log1p_tau, 0.0, math.log1p(TAU_LIMIT))
+        tau = torch.exp(log1p_tau) - 1.0
+
+        log_phase = torch.log(self.phase_of_orders(gamma, g1, g2, weight))
+        mean_g = weight * g1 + (1.0 - weight) * g2
+        # Diffusion sees albedo and g only as this ratio (van de Hulst 1980, section 14.1) and as the reduced optical depth.
+        similarity = torch.sqrt((1.0 - albedo) / torch.clamp(1.0 - albedo * mean_g, min=1e-3))
+        reduced = torch.log(1.0 + tau * (1.0 - mean_g))
+        scaled = [gamma / math.pi, torch.cos(gamma), 0.25 * log_phase, g1, g2, weight]
+        return torch.cat([*scaled, similarity, 0.25 * log1p_tau, 0.25 * reduced, torch.exp(-tau)], dim=1)
+
+    def phase_of_orders(self, gamma: Tensor, g1: Tensor, g2: Tensor, weight: Tensor) -> Tensor:
+        """``4 pi p`` at `gamma` after 1, 2, 4 and 8 scatterings: columns (n, 1) to (n, 4)."""
+        one = torch.ones_like(g1)
+        product = torch.index_select(_powers(g1, one), 1, self.degrees_1) * torch.index_select(_powers(g2, one), 1, self.degrees_2)
+        mixture = torch.index_select(_powers(weight, one), 1, self.degrees_1)
+        mixture = mixture * torch.index_select(_powers(1.0 - weight, one), 1, self.degrees_2) * self.binomials
+        a = torch.abs(product)
+        # (1 - |g|)^2 + 4 |g| sin^2 keeps its digits where 1 + g^2 - 2 g cos cancels, and half angles resolve the peak itself.
+        ahead, behind = torch.sin(0.5 * gamma), torch.cos(0.5 * gamma)
+        half = torch.where(product < 0.0, behind, ahead)
+        denominator = (1.0 - a) * (1.0 - a) + 4.0 * a * half * half
+        value = (1.0 - a) * (1.0 + a) / (denominator * torch.sqrt(denominator))
+        return torch.matmul(mixture * value, self.groups)
+
+
+class Block(nn.Module):
+    """``h = ReLU(V x + P f + W o + b)``, ``o' = ReLU(U h + c + o)``; the first block has no `o` to read."""
+
+    def __init__(self, width: int, first: bool) -> None:
+        super().__init__()
+        self.stencil = nn.Linear(POINTS, width)
+        self.features = nn.Linear(FEATURES, width, bias=False)
+        self.carried = None if first else nn.Linear(width, width, bias=False)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, mean: Tensor, scale: Tensor, f: Tensor, o: Tensor | None) -> Tensor:
+        """One level `x` (n, 225) to be standardised by `mean` and `scale`, the features `f`, the block before's output `o`."""
+        # Standardising the weights costs nothing beside standardising every row of x. Products accumulate into one buffer: each
+        # addmm becomes one Gemm with its addend in the exported graph.
+        weight = self.stencil.weight * scale
+        bias = self.stencil.bias - mean * weight.sum(dim=1)
+        h = torch.addmm(F.linear(f, self.features.weight, bias), x, weight.t())
+        if self.carried is None or o is None:
+            return F.relu(self.out(F.relu(h)))
+        h = F.relu(torch.addmm(h, o, self.carried.weight.t()))
+        return F.relu(torch.addmm(o + self.out.bias, h, self.out.weight.t()))
+
+
+class Network(nn.Module):
+    """j = 4 pi J / (albedo^2 E) from a stencil and an ``aux`` row: the contract of `deepclouds.model`.
+
+    The output is finite and positive for every finite input, because inputs are clamped to what is physical and the head is the
+    exponential of a clamped value. Products such as a phase peak times a depth are sums before the exponential.
+
+    Parameters
+    ----------
+    config
+        width, order of the levels, and what enters the logarithm.
+    """
+
+    level_mean: Tensor
+    level_scale: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.angle = AngleFeatures()
+        self.blocks = nn.ModuleList(Block(config.width, first=i == 0) for i in range(LEVELS))
+        self.fc_1 = nn.Linear(config.width + FEATURES, config.width)
+        self.fc_2 = nn.Linear(config.width + FEATURES, config.width)
+        self.head = nn.Linear(config.width, 1)
+        self.register_buffer("level_mean", torch.zeros(LEVELS))
+        self.register_buffer("level_scale", torch.ones(LEVELS))
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """He's initialisation, with small residual branches so that ten blocks keep the variance of one, and a head near zero."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        with torch.no_grad():
+            for block in self.blocks:
+                assert isinstance(block, Block)
+                block.out.weight.mul_(LEVELS**-0.5)
+                # Three sources add up to one input.
+                for source in (block.stencil, block.features, block.carried):
+                    if source is not None:
+                        source.weight.mul_(3**-0.5)
+            self.head.weight.mul_(0.1)
+
+    def fit_inputs(self, stencil: NDArray[np.float32], label: NDArray[np.float32]) -> None:
+        """Standardise each level to mean 0 and deviation 1 over `stencil` (n, 10, 225), and start the head at the mean label (n,)."""
+        with torch.no_grad():
+            for k in range(LEVELS):
+                x = self.compressed(torch.from_numpy(stencil[:, k]), k)
+                self.level_mean[k] = x.mean()
+                self.level_scale[k] = 1.0 / x.std().clamp(min=1e-3)
+            self.head.bias.fill_(math.log(max(float(label.mean(dtype=np.float64)), 1e-3)))
+
+    def compressed(self, level: Tensor, k: int) -> Tensor:
+        """What a block reads of level `k`: log(1 + c v) - log c = log(v + 1 / c), whose constant the standardisation takes up."""
+        return torch.log(torch.clamp(level, 0.0, STENCIL_LIMIT) + (2.0**-k if self.config.scale == "depth" else 1.0))
+
+    def forward(self, stencil: Tensor, aux: Tensor) -> Tensor:
+        """Predict j (n,) from `stencil` (n, 10, 225) and `aux` (n, 6)."""
+        levels = torch.unbind(stencil, dim=1)
+        f = self.angle(aux)
+        o: Tensor | None = None
+        for i, block in enumerate(self.blocks):
+            k = LEVELS - 1 - i if self.config.order == "coarse_first" else i
+            # Level by level, so that what is compressed is still in the cache when it is multiplied.
+            o = block(self.compressed(levels[k], k), self.level_mean[k], self.level_scale[k], f, o)
+        assert o is not None
+        hidden = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
+        hidden = F.relu(self.fc_2(torch.cat([hidden, f], dim=1)))
+        return torch.exp(torch.clamp(self.head(hidden).squeeze(1), LOWEST, HIGHEST))
+
+
+def _powers(value: Tensor, one: Tensor) -> Tensor:
+    """Columns value^0 to value^8 of (n, 1); products, because a power function of zero or of negative numbers is not portable."""
+    powers = [one]
+    for _ in range(max(ORDERS)):
+        powers.append(powers[-1] * value)
+    return torch.cat(powers, dim=1)

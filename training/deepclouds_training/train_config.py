@@ -1,0 +1,116 @@
+"""The configuration of a training run: defaults here, a TOML file over them, flags over both."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from deepclouds.errors import InputError
+from deepclouds_training.network import NetworkConfig
+from deepclouds_training.samples import SampleConfig
+
+
+class TrainConfig(BaseModel):
+    """Everything that decides how a run goes.
+
+    Attributes
+    ----------
+    data
+        folder of the data set.
+    seed
+        root of all random streams.
+    steps
+        optimiser steps, the length of the schedule unless `minutes` is given.
+    minutes
+        training time; the learning rate then follows the time elapsed.
+    batch
+        samples a step.
+    learning_rate, final_learning_rate, warmup
+        the rate rises over `warmup` steps and falls on a cosine to the final one.
+    ema
+        decay of the weights' running mean.
+    power
+        exponent of the loss's weight.
+    network, samples
+        the network's shape and the samples' selection.
+    valid_shards, valid_queries, valid_every
+        validation clouds, queries drawn from each, and steps between validations.
+    checkpoint_seconds
+        longest time between checkpoints.
+    tensorboard
+        write TensorBoard events as well.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    data: str
+    seed: int = 0
+    steps: int = Field(default=20000, ge=1)
+    minutes: float | None = Field(default=None, gt=0)
+    batch: int = Field(default=1024, ge=1)
+    learning_rate: float = Field(default=1e-3, gt=0)
+    final_learning_rate: float = Field(default=1e-5, ge=0)
+    warmup: int = Field(default=200, ge=0)
+    ema: float = Field(default=0.999, ge=0, lt=1)
+    power: float = Field(default=1.5, ge=0, le=2)
+    network: NetworkConfig = NetworkConfig()
+    samples: SampleConfig = SampleConfig()
+    valid_shards: int = Field(default=48, ge=1)
+    valid_queries: int = Field(default=512, ge=2)
+    valid_every: int = Field(default=1000, ge=1)
+    checkpoint_seconds: float = Field(default=100.0, ge=0, le=120)
+    tensorboard: bool = False
+
+    @property
+    def hash(self) -> str:
+        """sha256 of the resolved configuration."""
+        return hashlib.sha256(json.dumps(self.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+
+
+def read_config(path: Path, overrides: Mapping[str, Any]) -> TrainConfig:
+    """Read a TOML file; `overrides` that are not None win.
+
+    Raises
+    ------
+    InputError
+        for a file that is missing or no TOML, and for unknown keys or values out of range.
+    """
+    try:
+        given = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the TOML file of the run") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: no valid TOML ({error})") from error
+    return checked({**given, **{key: value for key, value in overrides.items() if value is not None}}, str(path))
+
+
+def checked(values: Mapping[str, Any], source: str) -> TrainConfig:
+    """Validate a dictionary read from `source`.
+
+    Raises
+    ------
+    InputError
+        for unknown keys, missing ones, or values out of range.
+    """
+    try:
+        config = TrainConfig.model_validate(dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{source}: {where}: {first['msg']} (got {first['input']!r}); the keys are {_keys()}") from error
+    pool = config.samples.shards * config.samples.queries
+    if config.batch > pool:
+        raise InputError(f"{source}: batch {config.batch} exceeds a pool of {pool} samples; raise samples.shards or samples.queries")
+    return config
+
+
+def _keys() -> str:
+    tables: dict[str, type[BaseModel]] = {"network": NetworkConfig, "samples": SampleConfig}
+    plain = [name for name in TrainConfig.model_fields if name not in tables]
+    return ", ".join(plain + [f"{table}.{name}" for table, model in tables.items() for name in model.model_fields])
