@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks import bench, make_scenes
+from benchmarks import bench, make_scenes, worker
 from benchmarks.equal_error import Timing, interpolated_seconds, unbiased_seconds
 from deepclouds.errors import InputError
 from deepclouds.exr import read_exr
@@ -161,7 +163,34 @@ def test_a_method_that_fails_is_named_and_the_rest_goes_on(tmp_path: Path, capsy
         patch.undo()
     out = capsys.readouterr().out.strip().splitlines()
     assert sum("did not run: ModuleNotFoundError" in line for line in out) == 3
-    assert out[-1] == "ball_isotropic: no speed-up, deepclouds was not run" or "did not run" in out[-1]
+    assert (tmp_path / "bench.csv").read_text().splitlines()[0].startswith("method,scene,spp")
+
+
+def test_the_runtime_is_timed_without_its_loading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected behaviour: two calls a setting with different seeds; the second is the warm one, less the loading it reports."""
+    calls: list[dict[str, object]] = []
+    clock = [10.0]
+    monkeypatch.setattr("benchmarks.worker.time.perf_counter", lambda: clock[0])
+
+    def render(scene: str, **options: object) -> SimpleNamespace:
+        calls.append(options)
+        clock[0] += 0.2 if len(calls) % 2 else 0.19
+        return SimpleNamespace(rgb=np.full((8, 8, 3), float(len(calls))), seconds={"load": 0.15, "total": 0.05})
+
+    runtime = ModuleType("deepclouds_runtime")
+    monkeypatch.setattr(runtime, "render", render, raising=False)
+    monkeypatch.setitem(sys.modules, "deepclouds_runtime", runtime)
+    arguments = ["deepclouds", "scene.xml", "--size", "8", "--spp", "0,16", "--seed", "5", "--out", str(tmp_path)]
+    assert worker.main(arguments) == 0
+    assert [c["spp"] for c in calls] == [None, None, 16, 16]
+    assert len({c["seed"] for c in calls}) == 4
+    assert all(c["defines"] == {"size": "8"} and c["model"] is None for c in calls)
+    default, fixed = json.loads((tmp_path / "deepclouds.json").read_text())
+    assert (default["spp"], fixed["spp"]) == (0, 16)
+    assert default["seconds_cold"] == pytest.approx(0.2)
+    assert default["seconds_warm"] == fixed["seconds_warm"] == pytest.approx(0.04)
+    assert fixed["seconds_cold"] is None
+    np.testing.assert_array_equal(read_exr(tmp_path / fixed["file"]).rgb(), 4.0)
 
 
 def test_a_worker_reports_its_last_complaint(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from deepclouds.metrics import (
 def scene(side: int = 48, channels: int = 3) -> np.ndarray:
     """Smooth positive truth with a black frame, like a cloud before a black sky."""
     y, x = np.mgrid[:side, :side] / side
-    truth = (0.2 + x + 0.5 * np.sin(6 * y) ** 2)[..., None] * np.linspace(1, 0.6, channels)
+    truth: np.ndarray = (0.2 + x + 0.5 * np.sin(6 * y) ** 2)[..., None] * np.linspace(1, 0.6, channels)
     truth[:4] = truth[:, :4] = 0
     return truth
 
@@ -35,8 +35,7 @@ def scene(side: int = 48, channels: int = 3) -> np.ndarray:
 def noisy(truth: np.ndarray, relative: float, rng: np.random.Generator) -> np.ndarray:
     """Unbiased, skewed noise with the given relative standard deviation: gamma distributed, as path tracing roughly is."""
     shape = 1 / relative**2
-    image: np.ndarray = truth * rng.gamma(shape, 1 / shape, size=truth.shape)
-    return image
+    return np.asarray(truth * rng.gamma(shape, 1 / shape, size=truth.shape))
 
 
 def test_figures_by_hand() -> None:
