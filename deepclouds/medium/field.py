@@ -50,11 +50,12 @@ class Field:
         self.majorant = float(sigma.max())
         self.step = 0.5 * float(volume.voxel_size.min())
         self._data = types.Float(np.ascontiguousarray(sigma).ravel())
-        self._stride_y, self._stride_z = nx, nx * ny
+        # Opaque, so that kernels compiled for one volume serve all others.
+        self._stride_y, self._stride_z = dr.opaque(types.UInt32, nx), dr.opaque(types.UInt32, nx * ny)
         inverse = np.linalg.inv(volume.to_world)
-        self._to_unit = [[float(v) for v in row] for row in inverse[:3]]
-        self._samples = [float(n) for n in volume.resolution]
-        self._last = [float(max(n - 1, 1)) for n in (nx, ny, nz)]
+        self._to_unit = [[dr.opaque(types.Float, float(v)) for v in row] for row in inverse[:3]]
+        self._samples = [dr.opaque(types.Float, float(n)) for n in volume.resolution]
+        self._last = [dr.opaque(types.Float, float(n - 2)) for n in (nx, ny, nz)]
 
     def to_unit(self, p: Any) -> Any:
         """World points to coordinates in the unit cube of the grid's box."""
@@ -77,12 +78,12 @@ class Field:
         low, frac = [], []
         for value, n, last in zip(unit, self._samples, self._last, strict=True):
             cell = dr.clip(dr.fma(value, n, -0.5), 0.0, n - 1)
-            index = dr.minimum(dr.floor(cell), last - 1)
+            index = dr.minimum(dr.floor(cell), last)
             low.append(t.UInt32(index))
             frac.append(cell - index)
         base = low[0] + low[1] * self._stride_y + low[2] * self._stride_z
         rows = []
-        for offset in (0, self._stride_y, self._stride_z, self._stride_z + self._stride_y):
+        for offset in (t.UInt32(0), self._stride_y, self._stride_z, self._stride_z + self._stride_y):
             a = dr.gather(t.Float, self._data, base + offset, inside)
             b = dr.gather(t.Float, self._data, base + (offset + 1), inside)
             rows.append(dr.fma(frac[0], b - a, a))

@@ -42,9 +42,10 @@ def first_collisions(
         return np.array(origins, np.float32), np.zeros(n, np.bool_)
     o = types.Array3f(*(types.Float(np.ascontiguousarray(origins[:, c], np.float32)) for c in range(3)))
     d = types.Array3f(*(types.Float(np.ascontiguousarray(directions[:, c], np.float32)) for c in range(3)))
-    rng = types.PCG32(n, initstate=types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])))
-    distance, hit = _track(field, o, d, rng)
+    key = dr.opaque(types.UInt64, int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
+    distance, hit = _track(field, o, d, types.PCG32(n, initstate=key))
     points = dr.fma(d, dr.select(hit, distance, 0), o)
+    dr.eval(points, hit)
     return np.array(points).T.astype(np.float32, copy=False), np.array(hit)
 
 

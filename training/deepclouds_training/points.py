@@ -16,7 +16,8 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
 from deepclouds_training.shards import ANYWHERE, FIRST_COLLISION, SECOND_COLLISION
 
-_TRIES = 200
+# Lines traced at the most for the collisions of one kind in one cloud.
+_MOST_LINES = 2**21
 
 
 def uniform_directions(rng: Generator, *shape: int) -> NDArray[np.float32]:
@@ -47,38 +48,54 @@ def sample_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Draw `n` points x and directions w; the shares `deeper` and `anywhere` are of the other two kinds.
 
-    Returns points (n, 3), directions (n, 3) and kinds (n,), in random order. A cloud too thin to be hit within a bounded number of
-    lines gets its missing collisions drawn anywhere in its box.
+    Returns points (n, 3), directions (n, 3) and kinds (n,), in random order. In a cloud so thin that a bounded number of lines does not
+    collide often enough, the missing collisions are drawn in proportion to extinction, which is their distribution in the thin limit.
     """
     second = int(round(deeper * n))
     loose = int(round(anywhere * n))
-    first = n - second - loose
-    found_points: list[NDArray[np.float32]] = []
-    found_w: list[NDArray[np.float32]] = []
-    kinds: list[NDArray[np.uint8]] = []
-    for kind, wanted in ((FIRST_COLLISION, first), (SECOND_COLLISION, second)):
-        missing = wanted
-        for _ in range(_TRIES):
-            if missing <= 0:
-                break
-            origins, w = random_lines(rng, field, 4 * missing + 1024)
-            points, hit = first_collisions(field, origins, w, int(rng.integers(2**63)))
-            points, w = points[hit], w[hit]
-            if kind == SECOND_COLLISION:
-                points, hit = first_collisions(field, points, w, int(rng.integers(2**63)))
-                points, w = points[hit], w[hit]
-            found_points.append(points[:missing])
-            found_w.append(w[:missing])
-            kinds.append(np.full(len(points[:missing]), kind, np.uint8))
-            missing -= len(points[:missing])
-        loose += max(missing, 0)
+    found = []
+    for kind, wanted in ((FIRST_COLLISION, n - second - loose), (SECOND_COLLISION, second)):
+        points, w = _collisions(rng, field, wanted, kind == SECOND_COLLISION)
+        found.append((points, w, np.full(wanted, kind, np.uint8)))
     lower, upper = field.volume.bounds
     margin = 0.05 * (upper - lower)
-    found_points.append(rng.uniform(lower - margin, upper + margin, (loose, 3)).astype(np.float32))
-    found_w.append(uniform_directions(rng, loose))
-    kinds.append(np.full(loose, ANYWHERE, np.uint8))
+    anywhere_points = rng.uniform(lower - margin, upper + margin, (loose, 3)).astype(np.float32)
+    found.append((anywhere_points, uniform_directions(rng, loose), np.full(loose, ANYWHERE, np.uint8)))
     order = rng.permutation(n)
-    return np.concatenate(found_points)[order], np.concatenate(found_w)[order], np.concatenate(kinds)[order]
+    points, w, kinds = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
+    return points, w, kinds
+
+
+def _collisions(rng: Generator, field: Field, wanted: int, second: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    parts_points, parts_w = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+    missing, lines, hits = wanted, 0, 0
+    while missing > 0 and lines < _MOST_LINES:
+        rate = max(hits / lines, 1e-3) if lines else 0.25
+        batch = min(int(1.1 * missing / rate) + 256, _MOST_LINES // 4)
+        origins, w = random_lines(rng, field, batch)
+        points, hit = first_collisions(field, origins, w, int(rng.integers(2**63)))
+        points, w = points[hit], w[hit]
+        if second:
+            points, hit = first_collisions(field, points, w, int(rng.integers(2**63)))
+            points, w = points[hit], w[hit]
+        lines, hits = lines + batch, hits + len(points)
+        parts_points.append(points[:missing])
+        parts_w.append(w[:missing])
+        missing -= len(points[:missing])
+    parts_points.append(_in_extinction(rng, field, missing))
+    parts_w.append(uniform_directions(rng, missing))
+    return np.concatenate(parts_points), np.concatenate(parts_w)
+
+
+def _in_extinction(rng: Generator, field: Field, n: int) -> NDArray[np.float32]:
+    """Points drawn voxel by voxel in proportion to extinction, uniform inside the voxel, (n, 3)."""
+    density = field.volume.density
+    cumulative = np.cumsum(density, dtype=np.float64)
+    index = np.minimum(np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right"), density.size - 1)
+    z, y, x = np.unravel_index(index, density.shape)
+    unit = (np.stack([x, y, z], axis=1) + rng.random((n, 3))) / np.array(field.volume.resolution)
+    to_world = field.volume.to_world
+    return (unit @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32)
 
 
 def sample_suns(rng: Generator, w: NDArray[np.float32], suns: int) -> NDArray[np.float32]:
