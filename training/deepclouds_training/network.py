@@ -6,6 +6,7 @@ features that resolve the phase peak, the phase function and the albedo are inpu
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Literal
 
@@ -111,12 +112,14 @@ class Block(nn.Module):
         self.carried = None if first else nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
 
-    def forward(self, x: Tensor, mean: Tensor, scale: Tensor, f: Tensor, o: Tensor | None) -> Tensor:
-        """One level `x` (n, 225) to be standardised by `mean` and `scale`, the features `f`, the block before's output `o`."""
-        # Standardising the weights costs nothing beside standardising every row of x. Products accumulate into one buffer: each
-        # addmm becomes one Gemm with its addend in the exported graph.
+    def standardised(self, mean: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+        """Weight and bias that take a raw level as V and b take ``(x - mean) * scale``; cheaper than standardising every row."""
         weight = self.stencil.weight * scale
-        bias = self.stencil.bias - mean * weight.sum(dim=1)
+        return weight, self.stencil.bias - mean * weight.sum(dim=1)
+
+    def forward(self, x: Tensor, weight: Tensor, bias: Tensor, f: Tensor, o: Tensor | None) -> Tensor:
+        """One level `x` (n, 225) through the `standardised` weights, the features `f`, the output `o` of the block before."""
+        # Products accumulate into one buffer: each addmm becomes one Gemm with its addend in the exported graph.
         h = torch.addmm(F.linear(f, self.features.weight, bias), x, weight.t())
         if self.carried is None or o is None:
             return F.relu(self.out(F.relu(h)))
@@ -149,6 +152,9 @@ class Network(nn.Module):
         self.head = nn.Linear(config.width, 1)
         self.register_buffer("level_mean", torch.zeros(LEVELS))
         self.register_buffer("level_scale", torch.ones(LEVELS))
+        # Levels in the order in which the blocks read them.
+        self.sequence = list(range(LEVELS))[:: -1 if config.order == "coarse_first" else 1]
+        self.is_folded = False
         self._initialise()
 
     def _initialise(self) -> None:
@@ -177,6 +183,18 @@ class Network(nn.Module):
                 self.level_scale[k] = 1.0 / x.std().clamp(min=1e-3)
             self.head.bias.fill_(math.log(max(float(label.mean(dtype=np.float64)), 1e-3)))
 
+    @torch.no_grad()
+    def folded(self) -> Network:
+        """The same function with the standardisation inside the weights, for export; not for training."""
+        result = copy.deepcopy(self)
+        for k, block in zip(self.sequence, result.blocks, strict=True):
+            assert isinstance(block, Block)
+            weight, bias = block.standardised(self.level_mean[k], self.level_scale[k])
+            block.stencil.weight.copy_(weight)
+            block.stencil.bias.copy_(bias)
+        result.is_folded = True
+        return result
+
     def compressed(self, level: Tensor, k: int) -> Tensor:
         """What a block reads of level `k`: log(1 + c v) - log c = log(v + 1 / c), whose constant the standardisation takes up."""
         return torch.log(torch.clamp(level, 0.0, STENCIL_LIMIT) + (2.0**-k if self.config.scale == "depth" else 1.0))
@@ -186,10 +204,14 @@ class Network(nn.Module):
         levels = torch.unbind(stencil, dim=1)
         f = self.angle(aux)
         o: Tensor | None = None
-        for i, block in enumerate(self.blocks):
-            k = LEVELS - 1 - i if self.config.order == "coarse_first" else i
+        for k, block in zip(self.sequence, self.blocks, strict=True):
             # Level by level, so that what is compressed is still in the cache when it is multiplied.
-            o = block(self.compressed(levels[k], k), self.level_mean[k], self.level_scale[k], f, o)
+            assert isinstance(block, Block)
+            if self.is_folded:
+                weight, bias = block.stencil.weight, block.stencil.bias
+            else:
+                weight, bias = block.standardised(self.level_mean[k], self.level_scale[k])
+            o = block(self.compressed(levels[k], k), weight, bias, f, o)
         assert o is not None
         hidden = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
         hidden = F.relu(self.fc_2(torch.cat([hidden, f], dim=1)))

@@ -21,7 +21,8 @@ def write_predicted_plot(path: Path, prediction: NDArray[np.float32], label: NDA
 
     p, y = prediction.astype(np.float64), label.astype(np.float64)
     seen = y > 0
-    low, high = float(np.quantile(p, 0.001)) / 2, float(np.quantile(p, 0.999)) * 4
+    both = np.concatenate([p, y[seen]])
+    low, high = float(np.quantile(both, 0.001)) / 1.5, float(np.quantile(both, 0.999)) * 1.5
     figure = Figure(figsize=(6, 5.2), dpi=110, layout="constrained")
     axes = figure.add_subplot()
     if np.any(seen):

@@ -1,0 +1,161 @@
+"""Predictions of a model file: checked when it is loaded, run by onnxruntime in batches that stay in the cache."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.errors import InputError
+from deepclouds.model import AUX, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS, ModelMetadata, initialiser_hash
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+
+MODELS = Path(__file__).parent / "models"
+DEFAULT_MODEL = "first"
+# A batch's stencils (9 kB each) and activations then fit into a core's second-level cache.
+BATCH = 512
+
+
+class Predictor:
+    """j = 4 pi J / (albedo^2 E) from a model file that follows the contract (docs/contract.md).
+
+    Parameters
+    ----------
+    model
+        path of an ONNX file, or the name of a released model; None is the default one.
+    threads
+        threads of the network; None takes every processor.
+
+    Attributes
+    ----------
+    path
+        the file.
+    metadata
+        what the file says about itself.
+
+    Raises
+    ------
+    InputError
+        when the file is missing or no ONNX file, lacks the metadata, follows another contract, or its weights are not those that the
+        metadata was written for.
+    """
+
+    def __init__(self, model: str | Path | None = None, threads: int | None = None) -> None:
+        if threads is not None and threads < 1:
+            raise InputError(f"threads = {threads}: at least one thread is needed")
+        self.path = find_model(model)
+        data = _read(self.path)
+        proto = _parse(data, self.path)
+        self.metadata = _checked_metadata(proto, self.path)
+        self._session = _session(data, self.path, threads or os.cpu_count() or 1)
+
+    def predict(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Predict j (n,) for stencils (n, 10, 225) and aux rows (n, 6), both float32 as the contract orders them.
+
+        Raises
+        ------
+        ValueError
+            for other shapes, and when an input or a prediction is not finite.
+        """
+        stencil, aux = np.ascontiguousarray(stencil, np.float32), np.ascontiguousarray(aux, np.float32)
+        n = len(aux)
+        if stencil.shape != (n, LEVELS, POINTS) or aux.shape != (n, len(AUX)):
+            raise ValueError(f"expected (n, {LEVELS}, {POINTS}) and (n, {len(AUX)}), got {stencil.shape} and {aux.shape}")
+        j = np.empty(n, np.float32)
+        for start in range(0, n, BATCH):
+            rows = slice(start, start + BATCH)
+            j[rows] = self._session.run([OUTPUT], {INPUT_STENCIL: stencil[rows], INPUT_AUX: aux[rows]})[0]
+        # The graph clamps its inputs, so only NaN gets through, from an input to the output or out of damaged weights.
+        if not np.all(np.isfinite(j)):
+            raise ValueError(f"{np.count_nonzero(~np.isfinite(j))} of {n} predictions of {self.path} are not finite; check the inputs for NaN")
+        return j
+
+    def out_of_range(self, aux: NDArray[np.float32]) -> dict[str, int]:
+        """How many of the rows `aux` (n, 6) lie outside of what the model was trained on, for every input."""
+        counts = {}
+        for column, spec in zip(np.asarray(aux, np.float64).T, AUX, strict=True):
+            low, high = self.metadata.ranges[spec.name]
+            # The range was measured in float32, possibly by another formula for the same angle.
+            slack = 1e-4 * max(1.0, abs(low), abs(high))
+            counts[spec.name] = int(np.count_nonzero(~((column >= low - slack) & (column <= high + slack))))
+        return counts
+
+
+def find_model(model: str | Path | None) -> Path:
+    """The file that `model` means: a path, or the name of a released model.
+
+    Raises
+    ------
+    InputError
+        when there is no such file; the message lists the released ones.
+    """
+    name = DEFAULT_MODEL if model is None else model
+    is_name = isinstance(name, str) and not Path(name).suffix and "/" not in name and os.sep not in name
+    path = MODELS / f"{name}.onnx" if is_name else Path(name)
+    if path.is_file():
+        return path
+    if is_name:
+        released = sorted(p.stem for p in MODELS.glob("*.onnx"))
+        raise InputError(f"no released model is named '{name}'; there are: {', '.join(released) or 'none'}; a path ends in .onnx")
+    raise InputError(f"{path}: no such model file; give the path of a file made by `deepclouds export` or the name of a released model")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _parse(data: bytes, path: Path) -> ModelProto:
+    # onnxruntime does not show a graph's initialisers, onnx does; it is imported here because nothing but loading needs it.
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.load_from_string(data)
+    except DecodeError as error:
+        raise InputError(f"{path}: not an ONNX file, or cut short; export or download it again") from error
+    if not model.graph.node:
+        raise InputError(f"{path}: not an ONNX file: it holds no graph; export or download it again")
+    return model
+
+
+def _checked_metadata(model: ModelProto, path: Path) -> ModelMetadata:
+    from onnx import numpy_helper
+
+    metadata = ModelMetadata.from_properties({p.key: p.value for p in model.metadata_props}, str(path))
+    metadata.require_this_contract(str(path))
+    inputs, outputs = [v.name for v in model.graph.input], [v.name for v in model.graph.output]
+    if inputs != [INPUT_STENCIL, INPUT_AUX] or outputs != [OUTPUT]:
+        raise InputError(f"{path}: the graph maps {inputs} to {outputs}, the contract {[INPUT_STENCIL, INPUT_AUX]} to {[OUTPUT]}")
+    try:
+        found = initialiser_hash((i.name, numpy_helper.to_array(i)) for i in model.graph.initializer)
+    except Exception as error:
+        raise InputError(f"{path}: its weights cannot be read ({error}); export or download it again") from error
+    if found != metadata.initialisers_sha256:
+        raise InputError(
+            f"{path}: the weights' sha256 is {found[:16]}..., the metadata says {metadata.initialisers_sha256[:16]}...; "
+            "the file was damaged or edited: export or download it again"
+        )
+    return metadata
+
+
+def _session(data: bytes, path: Path, threads: int) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    # Tracing and prediction alternate: threads that spin while they wait for the next batch would take the tracer's processors.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise InputError(f"{path}: onnxruntime refuses the file ({error})") from error
