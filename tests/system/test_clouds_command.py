@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deepclouds_training.clouds import FAMILIES, make_cloud
+from deepclouds_training.clouds.command import main
 
 from deepclouds.errors import InputError
 from deepclouds.volume import read_vol
-from deepclouds_training.clouds import FAMILIES, make_cloud
-from deepclouds_training.clouds.command import main
 
 
 def run(*argv: object) -> int:

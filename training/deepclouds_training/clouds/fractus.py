@@ -50,7 +50,7 @@ def build(parameters: FractusParameters, streams: Streams) -> Field:
         threshold = float(np.quantile(held[::7], 1 - parameters.cover)) if len(held) > 50 else 0.0
         # A tail without a ceiling: a few dense cores among thin shreds.
         return np.asarray(
-            smoothstep(threshold, threshold + 0.9, value) * np.exp(np.float32(0.9) * (value - np.float32(threshold))), np.float32
+            smoothstep(threshold, threshold + 0.9, value) * np.exp(np.float32(1.2) * (value - np.float32(threshold))), np.float32
         )
 
     return Field(
