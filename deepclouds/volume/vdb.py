@@ -23,8 +23,8 @@ from deepclouds.volume._clean import clean
 from deepclouds.volume._replacing import replacing
 from deepclouds.volume._volume import Volume
 
-MAX_VOXELS = 2**32
-"""Largest box that is read densely: 16 GiB of float32. A grid with two far-flung voxels must not exhaust the machine."""
+MAX_VOXELS = 2**30
+"""Largest box that is read densely: 4 GiB of float32. A grid with two far-flung voxels must not exhaust the machine."""
 
 # OpenVDB keeps its own facts among a grid's metadata, under these names.
 _RESERVED = ("class", "name", "is_local_space", "is_saved_as_half_float", "vector_type", "value_type")

@@ -42,8 +42,8 @@ def test_written_bytes_are_those_of_the_format(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "dtype", "scale"), [(2, np.float16, 1.0), (3, np.uint8, 1 / 255)])
-def test_narrow_types(tmp_path: Path, kind: int, dtype: type, scale: float) -> None:
-    values = np.array([0, 1, 2, 3, 128, 255], dtype)
+def test_narrow_types(tmp_path: Path, kind: int, dtype: type[np.float16] | type[np.uint8], scale: float) -> None:
+    values = np.array([0, 1, 2, 3, 128, 255]).astype(dtype)
     (tmp_path / "a.vol").write_bytes(vol_bytes(values.tobytes(), kind))
     np.testing.assert_allclose(read_vol(tmp_path / "a.vol").density.ravel(), values.astype(np.float64) * scale, rtol=1e-6)
 

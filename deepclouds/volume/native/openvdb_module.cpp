@@ -123,6 +123,14 @@ private:
                                " active voxels and has " + std::to_string(found) + ": the file is damaged");
             }
         }
+        const auto lower = entry.grid->getMetadata<openvdb::Vec3IMetadata>(openvdb::GridBase::META_FILE_BBOX_MIN);
+        const auto upper = entry.grid->getMetadata<openvdb::Vec3IMetadata>(openvdb::GridBase::META_FILE_BBOX_MAX);
+        if (lower && upper && !entry.descriptor.isInstance()) {
+            const openvdb::CoordBBox box = entry.grid->evalActiveVoxelBoundingBox();
+            if (!box.empty() && (box.min().asVec3i() != lower->value() || box.max().asVec3i() != upper->value())) {
+                throw VdbError("the grid '" + entry.descriptor.gridName() + "' does not fill the box that its file states: the file is damaged");
+            }
+        }
     }
 
     std::ifstream stream_;
