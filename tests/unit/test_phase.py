@@ -85,7 +85,8 @@ def directions(count: int) -> NDArray[np.float32]:
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     d[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     d[6], d[7] = (0, 1e-4, -1), (1e-4, 0, 1)
-    return (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+    unit: NDArray[np.float32] = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+    return unit
 
 
 def rotate(d: NDArray[np.float32], cosine: Floats, azimuth: Floats) -> Floats:
