@@ -4,18 +4,57 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
+from deepclouds_runtime.stratified import Stratified
 
 # Cells of the table never drawn would bias the image where the table misses a light between its samples.
 _UNIFORM_SHARE = 0.02
 _MAX_WIDTH = 2048
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+class LightSource(Protocol):
+    """Light from many directions, one of which is drawn at a time."""
+
+    def sample(self, u: Any, v: Any) -> tuple[Any, Any]:
+        """Directions TOWARD the light and their densities per steradian, from numbers in [0, 1)."""
+        ...
+
+    def density(self, direction: Any) -> Any:
+        """Density per steradian with which `sample` draws these directions."""
+        ...
+
+    def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
+        """Radiance that arrives at `points` from `direction` where there is no cloud; one array a colour channel."""
+        ...
+
+
+class Shade:
+    """What the opaque surfaces of a scene keep away.
+
+    Parameters
+    ----------
+    types
+        Dr.Jit types.
+    surfaces
+        Mitsuba scene of the surfaces alone, or None.
+    """
+
+    def __init__(self, types: ModuleType, surfaces: Any) -> None:
+        self.types, self.surfaces = types, surfaces
+
+    def visible(self, points: Any, directions: Any) -> Any:
+        """Whether no surface stands between the points and what lies in these directions."""
+        if self.surfaces is None:
+            return self.types.Bool(True)
+        mi = mitsuba()
+        return ~plain(self.types, self.surfaces.ray_test(mi.Ray3f(mi.Point3f(points), mi.Vector3f(directions))))
 
 
 class Environment:
@@ -35,6 +74,8 @@ class Environment:
         the table's frame, column position u at the direction (sin(2 pi u), ., -cos(2 pi u)).
     frame
         3 x 3 rotation from the table's frame to the world.
+    shade
+        what stands between the environment and a point.
     """
 
     def __init__(
@@ -43,8 +84,10 @@ class Environment:
         radiance: Callable[[Any], list[Any]],
         power: NDArray[np.floating[Any]],
         frame: NDArray[np.floating[Any]] | None = None,
+        shade: Shade | None = None,
     ) -> None:
         self.types = types
+        self._shade = shade or Shade(types, None)
         self.radiance = radiance
         self._frame = np.eye(3) if frame is None else np.asarray(frame, np.float64)
         rows, columns = power.shape
@@ -57,11 +100,15 @@ class Environment:
         # Cumulative sums a row and a column keep their digits where one sum over all cells would not.
         by_row = _cumulative(weight.sum(axis=1)[None])[0]
         by_column = _cumulative(weight)
-        self._rows, self._columns = rows, columns
         self._row_sums = types.Float(by_row.ravel())
         self._column_sums = types.Float(by_column.ravel())
         self._edges = types.Float(edges.astype(np.float32))
-        self._shape = dr.opaque(types.UInt32, rows), dr.opaque(types.UInt32, columns)
+        self._shape = rows, columns
+
+    def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
+        """Radiance past the surfaces; see `LightSource`."""
+        seen = self._shade.visible(points, direction)
+        return [dr.select(seen, value, 0) for value in self.radiance(direction)]
 
     def sample(self, u: Any, v: Any) -> tuple[Any, Any]:
         """Directions toward the environment, and their densities per steradian, from numbers `u`, `v` in [0, 1)."""
@@ -73,8 +120,8 @@ class Environment:
         probability = (high - low) * (right - left)
         upper, lower = dr.gather(t.Float, self._edges, row), dr.gather(t.Float, self._edges, row + 1)
         up = dr.fma((u - low) / (high - low), lower - upper, upper)
-        across = (t.Float(column) + dr.clip((v - left) / (right - left), 0, 1)) / t.Float(n_columns)
-        density = probability * t.Float(n_columns) / (2 * dr.pi * (upper - lower))
+        across = (t.Float(column) + dr.clip((v - left) / (right - left), 0, 1)) / n_columns
+        density = probability * n_columns / (2 * dr.pi * (upper - lower))
         sine, (s, c) = dr.safe_sqrt(1 - up * up), dr.sincos(2 * dr.pi * across)
         return self._to_world(sine * s, up, -sine * c), density
 
@@ -85,21 +132,21 @@ class Environment:
         m = self._frame
         x, y, z = (direction.x * float(m[0, i]) + direction.y * float(m[1, i]) + direction.z * float(m[2, i]) for i in range(3))
         theta = dr.acos(dr.clip(y, -1, 1))
-        row = dr.minimum(t.UInt32(theta * (1 / dr.pi) * t.Float(n_rows)), n_rows - 1)
+        row = dr.minimum(t.UInt32(theta * (1 / dr.pi) * n_rows), n_rows - 1)
         u = dr.atan2(x, -z) * (0.5 / dr.pi)
         u = u - dr.floor(u)
-        column = dr.minimum(t.UInt32(u * t.Float(n_columns)), n_columns - 1)
+        column = dr.minimum(t.UInt32(u * n_columns), n_columns - 1)
         offset = row * (n_columns + 1) + column
         probability = (dr.gather(t.Float, self._row_sums, row + 1) - dr.gather(t.Float, self._row_sums, row)) * (
             dr.gather(t.Float, self._column_sums, offset + 1) - dr.gather(t.Float, self._column_sums, offset)
         )
         upper, lower = dr.gather(t.Float, self._edges, row), dr.gather(t.Float, self._edges, row + 1)
-        return probability * t.Float(n_columns) / (2 * dr.pi * (upper - lower))
+        return probability * n_columns / (2 * dr.pi * (upper - lower))
 
-    def _find(self, sums: Any, offset: Any, count: Any, u: Any) -> tuple[Any, Any, Any]:
+    def _find(self, sums: Any, offset: Any, count: int, u: Any) -> tuple[Any, Any, Any]:
         """Index of the interval of a cumulative sum that holds `u`, and the interval's ends."""
         t = self.types
-        index = dr.binary_search(t.UInt32(0), count, lambda i: dr.gather(t.Float, sums, offset + i + 1) <= u)
+        index = dr.binary_search(0, count, lambda i: dr.gather(t.Float, sums, offset + i + 1) <= u)
         index = dr.minimum(index, count - 1)
         return index, dr.gather(t.Float, sums, offset + index), dr.gather(t.Float, sums, offset + index + 1)
 
@@ -130,7 +177,7 @@ def mitsuba_radiance(types: ModuleType, emitter: Any) -> Callable[[Any], list[An
     return radiance
 
 
-def environment(types: ModuleType, emitter: Any) -> Environment:
+def environment(types: ModuleType, emitter: Any, shade: Shade) -> Environment:
     """The `envmap` or `constant` emitter of a Mitsuba scene as a light source."""
     mi = mitsuba()
     radiance = mitsuba_radiance(types, emitter)
@@ -138,11 +185,30 @@ def environment(types: ModuleType, emitter: Any) -> Environment:
     frame = frame / np.linalg.norm(frame, axis=0)
     parameters = mi.traverse(emitter)
     if "data" not in parameters:
-        return Environment(types, radiance, np.ones((1, 1)), frame)
+        return Environment(types, radiance, np.ones((1, 1)), frame, shade)
     map_rows, map_columns = np.array(parameters["data"]).shape[:2]
     columns = int(min(_MAX_WIDTH, max(64, map_columns)))
     rows = max(columns // 2, 32)
-    return Environment(types, radiance, _table(types, radiance, frame, rows, columns, max(2, -(-2 * map_rows // rows))), frame)
+    power = _table(types, radiance, frame, rows, columns, max(2, -(-2 * map_rows // rows)))
+    return Environment(types, radiance, power, frame, shade)
+
+
+def directions_of_cells(rows: int, columns: int, part: tuple[float, float]) -> NDArray[np.float64]:
+    """Unit vectors (rows, columns, 3) at the place `part` (0..1, 0..1) of every cell, in the table's frame."""
+    theta = (np.arange(rows) + part[0])[:, None] / rows * np.pi
+    phi = (np.arange(columns) + part[1])[None, :] / columns * 2 * np.pi
+    return np.stack(np.broadcast_arrays(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)), axis=-1)
+
+
+def luminance(values: list[Any], count: int) -> NDArray[np.float64]:
+    """Luminance (count,) of a colour given as one device array a channel; negative values count as 0."""
+    weights = _LUMINANCE if len(values) == 3 else (1.0,)
+    total = np.zeros(count)
+    # Together, or each channel would trace its own rays again.
+    dr.eval(values)
+    for weight, value in zip(weights, values, strict=True):
+        total += weight * np.maximum(np.broadcast_to(np.array(value), count), 0)
+    return total
 
 
 def _table(
@@ -151,16 +217,8 @@ def _table(
     """Mean luminance of every cell, from `parts` x `parts` directions in each."""
     total = np.zeros((rows, columns))
     for part in np.ndindex(parts, parts):
-        theta = (np.arange(rows) + (part[0] + 0.5) / parts)[:, None] / rows * np.pi
-        phi = (np.arange(columns) + (part[1] + 0.5) / parts)[None, :] / columns * 2 * np.pi
-        local = np.stack(np.broadcast_arrays(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)), axis=-1)
+        local = directions_of_cells(rows, columns, ((part[0] + 0.5) / parts, (part[1] + 0.5) / parts))
         world = (local.reshape(-1, 3) @ frame.T).astype(np.float32)
         values = radiance(types.Array3f(*(types.Float(np.ascontiguousarray(world[:, c])) for c in range(3))))
-        weights = _LUMINANCE if len(values) == 3 else (1.0,)
-        total += sum(w * np.maximum(np.array(v + dr.zeros(types.Float, len(world))), 0) for w, v in zip(weights, values, strict=True)).reshape(
-            rows, columns
-        )
+        total += luminance(values, len(world)).reshape(rows, columns)
     return total / parts**2
-
-
-__all__ = ["Environment", "environment", "mitsuba_radiance", "plain"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -15,11 +15,11 @@ from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
-from deepclouds_runtime.lights import environment, mitsuba_radiance
+from deepclouds_runtime.lights import Shade, environment, mitsuba_radiance
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, WalkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.surfaces import reflected
+from deepclouds_runtime.surfaces import Reflectors, reflected, reflected_from_cloud
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
 Image = NDArray[np.float32]
@@ -74,6 +74,8 @@ class Renderer:
         ``"network"``, or ``"walks"``: J from one Monte Carlo walk a query in place of the network, for tests and references.
     environment_directions
         directions drawn from an environment at each sample of the cloud.
+    interreflection
+        whether surfaces receive the cloud's light, and the cloud that of the surfaces, one reflection each.
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
@@ -90,6 +92,7 @@ class Renderer:
         *,
         multiple: str = "network",
         environment_directions: int = 2,
+        interreflection: bool = True,
         load_seconds: float = 0.0,
     ) -> None:
         if multiple not in ("network", "walks"):
@@ -106,11 +109,22 @@ class Renderer:
             if predictor is None:
                 raise InputError("multiple scattering needs a model; give one, or render single scattering alone (max_depth 2)")
             self._network = NetworkScattering(self._field, predictor)
-        environments = []
+        shade = Shade(self._types, scene.surfaces)
+        sources = []
         if scene.environment is not None:
-            environments.append((environment(self._types, scene.environment), environment_directions))
-        self._lights = Lights(scene.suns, tuple(environments), scene.surfaces)
+            sources.append((environment(self._types, scene.environment, shade), environment_directions))
+        self._lights = Lights(scene.suns, tuple(sources), shade)
+        # Single scattering alone stops before light that surfaces have reflected, as volpath with max_depth 2 does.
+        self._interreflection = interreflection and scene.surfaces is not None and scene.max_depth != 2
+        self.model_hash: str | None = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
+
+    def samples(self, spp: int | None) -> int:
+        """Samples a pixel of a render that is asked for `spp`: those of the camera's sampler for None."""
+        count = int(self.scene.sensor.sampler().sample_count()) if spp is None else int(spp)
+        if count < 1:
+            raise InputError(f"spp = {count}: a pixel needs at least one sample")
+        return count
 
     def render(self, spp: int | None = None, seed: int = 0, progress: Callable[[float], None] | None = None) -> RenderResult:
         """Render an image.
@@ -130,14 +144,18 @@ class Renderer:
             when `spp` is below 1.
         """
         scene, types = self.scene, self._types
-        samples = int(scene.sensor.sampler().sample_count()) if spp is None else int(spp)
-        if samples < 1:
-            raise InputError(f"spp = {samples}: a pixel needs at least one sample")
+        samples = self.samples(spp)
         started = time.perf_counter()
         scattering = None
         if scene.max_depth != 2:
             scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
-        work = _Work(scene, Cloud(self._field, scene.albedo, scene.g, scattering), self._lights, types, samples, seed)
+        cloud, lights = Cloud(self._field, scene.albedo, scene.g, scattering), self._lights
+        work = _Work(scene, cloud, lights, lights, types, samples, seed, self._interreflection)
+        if self._interreflection:
+            clock = time.perf_counter()
+            reflectors = Reflectors(cloud, lights, seed & 0xFFFFFFFF)
+            work.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
+            work.spent("probe", clock)
         width, height = scene.size
         total = width * height
         pixels = max(1, _PASS // samples)
@@ -157,10 +175,12 @@ class _Work:
 
     scene: CloudScene
     cloud: Cloud
-    lights: Lights
+    on_surfaces: Lights
+    on_cloud: Lights
     types: Any
     samples: int
     seed: int
+    interreflection: bool
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
     rows: dict[str, list[Image]] = field(default_factory=dict)
@@ -180,10 +200,10 @@ class _Work:
         if scene.surfaces is not None:
             interaction, end, shown = self._surfaces(origin, direction, end)
         clock = time.perf_counter()
-        light = cloud_light(self.cloud, self.lights, origin, direction, end, numbers, self.counts)
+        light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
         dr.eval(light.direct, light.indirect)
         dr.sync_thread()
-        self._spent("cloud", clock)
+        self.spent("cloud", clock)
         clock = time.perf_counter()
         self._collect("volume_direct", light.direct)
         self._collect("volume_indirect", light.indirect)
@@ -194,7 +214,11 @@ class _Work:
         behind = through
         alpha = light.opacity
         if interaction is not None:
-            colours = reflected(self.cloud, self.lights, interaction, numbers)
+            colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
+            if self.interreflection:
+                weight = dr.select(shown, through, 0)
+                thrown = reflected_from_cloud(self.cloud, self.on_surfaces, interaction, weight, numbers, self.counts)
+                colours = [a + b for a, b in zip(colours, thrown, strict=True)]
             self._collect("surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)
             alpha = alpha + dr.select(shown, through, 0)
@@ -203,7 +227,7 @@ class _Work:
             self._collect("background", [value * behind for value in sky])
             alpha = alpha + behind
         self._collect("A", [alpha])
-        self._spent("surfaces and background", clock)
+        self.spent("surfaces and background", clock)
 
     def _rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any, Any]:
         """Camera rays of the lanes: origin, direction, end, and the camera's place."""
@@ -214,7 +238,8 @@ class _Work:
         y = types.Float(row) + numbers.number(stratified.PIXEL_Y)
         place = mi.Point2f(x / types.Float(width), y / types.Float(height))
         ray, _ = sensor.sample_ray(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
-        camera = plain(types, sensor.world_transform().translation())
+        place_of_camera = np.array(sensor.world_transform().matrix, np.float32).reshape(4, 4)[:3, 3]
+        camera = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in place_of_camera))
         return plain(types, ray.o), plain(types, ray.d), plain(types, ray.maxt), camera
 
     def _surfaces(self, origin: Any, direction: Any, end: Any) -> tuple[Any, Any, Any]:
@@ -229,10 +254,13 @@ class _Work:
     def _collect(self, name: str, values: list[Any]) -> None:
         """Average the samples of each pixel and keep the result under `name`."""
         n = self.samples
+        # Together, or each channel would trace its own rays again.
+        dr.eval(values)
         rows = [np.array(dr.block_sum(value, n)) * np.float32(1 / n) for value in values]
         self.rows.setdefault(name, []).append(np.stack(rows, axis=-1))
 
-    def _spent(self, stage: str, since: float) -> None:
+    def spent(self, stage: str, since: float) -> None:
+        """Add the seconds since `since` to a stage."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - since
 
     def image(self, height: int, width: int) -> dict[str, Image]:

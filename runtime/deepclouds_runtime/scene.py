@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
 from deepclouds.volume import Volume
-from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
+from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.placement import box_transform, cube_transform, locate
 
 _LOG = logging.getLogger(__name__)
@@ -107,7 +107,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
         found = "no shape has an interior medium" if not containers else f"{len(containers)} shapes have an interior medium"
         raise InputError(f"{found}; deepclouds renders scenes with exactly one cloud: a shape with a null BSDF and a medium inside")
     volume, scale, albedo, g = _read_medium(containers[0])
-    suns, environment = _read_lights(scene)
+    suns, environment = read_lights(scene)
     integrator = scene.integrator()
     if max_depth is None:
         max_depth = _integrator_depth(integrator)
@@ -186,7 +186,8 @@ def surfaces_alone(surfaces: list[Any]) -> Any:
     return mitsuba().load_dict({"type": "scene", **{f"surface{i}": shape for i, shape in enumerate(surfaces)}})
 
 
-def _read_lights(scene: Any) -> tuple[tuple[Sun, ...], Any]:
+def read_lights(scene: Any) -> tuple[tuple[Sun, ...], Any]:
+    """Suns and the environment emitter (or None) of a Mitsuba scene; raises InputError for lights of other kinds."""
     mi = mitsuba()
     suns: list[Sun] = []
     environment = None
@@ -290,12 +291,15 @@ def _check_cover(container: Any, volume: Volume) -> None:
     filled = np.argwhere(volume.density > 0)[:, ::-1]
     if not len(filled):
         return
-    shape = np.array(volume.resolution)
-    # Interpolation carries a voxel's value over to its neighbours' centres, but not beyond the box.
-    corners = np.concatenate([np.clip(filled + offset, 0, shape) for offset in np.ndindex(2, 2, 2)]) / shape
+    lowest, highest = filled.min(axis=0), filled.max(axis=0) + 1
+    cube = _container_cube(container)
+    if cube is not None:
+        # A parallelepiped holds the voxels when it holds the corners of the box around them.
+        corners = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, highest, lowest) / np.array(volume.resolution)
+    else:
+        corners = np.concatenate([filled + offset for offset in np.ndindex(2, 2, 2)]) / np.array(volume.resolution)
     world = corners @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
     extent = float(np.ptp(world, axis=0).max())
-    cube = _container_cube(container)
     if cube is not None:
         unit = (world - cube[:3, 3]) @ np.linalg.inv(cube[:3, :3]).T
         outside = np.any((unit < -1e-4) | (unit > 1 + 1e-4), axis=1)
@@ -346,14 +350,3 @@ def _read_albedo(medium: Any, parameters: Any, volume: Volume) -> tuple[float, .
         if value.size in (1, channels):
             return tuple(float(v) for v in np.broadcast_to(value, channels))
     raise InputError("the medium's albedo has no constant value; use <rgb name='albedo' .../> or a float")
-
-
-def types_for_scene() -> Any:
-    """Dr.Jit types of Mitsuba's current variant."""
-    return types_of(mitsuba())
-
-
-def camera_origin(sensor: Any) -> Any:
-    """World position of the camera's pinhole, as a plain array."""
-    types = types_for_scene()
-    return plain(types, sensor.world_transform().translation())

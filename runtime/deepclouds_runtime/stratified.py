@@ -38,24 +38,34 @@ class Stratified:
 
     def __init__(self, types: ModuleType, pixel: Any, sample: Any, count: Any, seed: Any) -> None:
         self._types, self._pixel, self._sample, self._count, self._seed = types, pixel, sample, count, seed
+        self._spread = True
 
     def number(self, dimension: int, part: int = 0, parts: int = 1) -> Any:
         """The number of `dimension`; `part` of `parts` numbers of each sample that continue the same sequence."""
         u32 = self._types.UInt32
+        if not self._spread:
+            mixed = self._pixel ^ _hash(u32, self._sample * parts + part + _hash(u32, self._seed + u32(0x85EBCA6B) * (dimension + 1)))
+            return _unit(self._types, _hash(u32, mixed))
         shift = _hash(u32, self._pixel ^ _hash(u32, self._seed + u32(0x9E3779B9) * (dimension + 1)))
         if dimension == DEPTH:
             return (self._types.Float(self._sample) + _unit(self._types, shift)) / self._types.Float(self._count)
         index = self._sample * parts + part
         return _unit(self._types, index * u32(_STEPS[dimension]) + shift)
 
+    def unrelated(self) -> Stratified:
+        """Numbers for the same lanes that are independent of these, and of each other: for integrals inside of an integral."""
+        other = Stratified(self._types, self._pixel, self._sample, self._count, self._seed ^ self._types.UInt32(0xC2B2AE35))
+        other._spread = False
+        return other
+
     def take(self, lanes: Any) -> Stratified:
         """The same numbers for the lanes with these indices only."""
         import drjit as dr
 
-        gather = self._types.UInt32
-        return Stratified(
-            self._types, dr.gather(gather, self._pixel, lanes), dr.gather(gather, self._sample, lanes), self._count, self._seed
-        )
+        pixel, sample = (dr.gather(self._types.UInt32, values, lanes) for values in (self._pixel, self._sample))
+        taken = Stratified(self._types, pixel, sample, self._count, self._seed)
+        taken._spread = self._spread
+        return taken
 
 
 def _unit(types: ModuleType, bits: Any) -> Any:

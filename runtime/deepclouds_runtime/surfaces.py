@@ -1,16 +1,24 @@
-"""Light that opaque surfaces reflect straight from the lights, through the cloud and past other surfaces."""
+"""Light on opaque surfaces: straight from the lights, and from the cloud; and what the surfaces send back to the cloud."""
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
 
 from deepclouds.medium.optical_depth import optical_depth
+from deepclouds.medium.phase import rotate_to
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
+from deepclouds_runtime.lights import Environment, directions_of_cells, luminance
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.transport import Cloud, Lights
+from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
+
+_PROBE_ROWS = 32
+_PROBE_PARTS = 4
 
 
 def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratified) -> list[Any]:
@@ -27,37 +35,36 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
 
     Notes
     -----
-    Light between surfaces, and light scattered by the cloud onto them, are not part of it.
+    Light between surfaces is not part of it.
     """
     mi, types = mitsuba(), cloud.field.types
     context = mi.BSDFContext()
     bsdf = interaction.bsdf()
     valid = interaction.is_valid()
-    n = dr.width(interaction.p)
-    total = [dr.zeros(types.Float, n) for _ in cloud.albedo]
+    total = [dr.zeros(types.Float, dr.width(interaction.p)) for _ in cloud.albedo]
     jitter = numbers.number(stratified.SHADOW)
 
-    def through(omega: Any) -> Any:
-        """Share of the light from direction `omega` that arrives."""
-        ray = interaction.spawn_ray(mi.Vector3f(omega))
-        tau = optical_depth(
-            cloud.field, plain(types, ray.o), omega, types.Float(0), dr.largest(types.Float), jitter, plain(types, valid)
-        )
-        return dr.select(plain(types, valid & ~lights.surfaces.ray_test(ray, active=valid)), dr.exp(-tau), 0)
+    def through(omega: Any) -> tuple[Any, Any]:
+        """Share of the light from direction `omega` that the cloud lets pass, and where the ray starts."""
+        origin = plain(types, interaction.spawn_ray(mi.Vector3f(omega)).o)
+        tau = optical_depth(cloud.field, origin, omega, types.Float(0), dr.largest(types.Float), jitter, plain(types, valid))
+        return dr.exp(-tau), origin
 
     def facing(omega: Any) -> list[Any]:
         return channels(types, bsdf.eval(context, interaction, interaction.to_local(mi.Vector3f(omega)), valid))
 
     for sun in lights.suns:
         omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
-        share = through(omega)
+        share, origin = through(omega)
+        share = dr.select(lights.shade.visible(origin, omega), share, 0)
         for c, value in enumerate(facing(omega)):
             total[c] += value * share * dr.opaque(types.Float, sun.irradiance[c])
-    for environment, _ in lights.environments:
-        omega, density = environment.sample(numbers.number(stratified.LIGHT_U), numbers.number(stratified.LIGHT_V))
+    for source, _ in lights.sources:
+        omega, density = source.sample(numbers.number(stratified.LIGHT_U), numbers.number(stratified.LIGHT_V))
         other = plain(types, bsdf.pdf(context, interaction, interaction.to_local(mi.Vector3f(omega)), valid))
-        share = through(omega) / (density + other)
-        for c, (value, light) in enumerate(zip(facing(omega), environment.radiance(omega), strict=True)):
+        share, origin = through(omega)
+        share = share / (density + other)
+        for c, (value, light) in enumerate(zip(facing(omega), source.arriving(origin, omega, numbers), strict=True)):
             total[c] += value * light * share
         sample, weight = bsdf.sample(
             context,
@@ -69,7 +76,120 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
         omega = plain(types, interaction.to_world(sample.wo))
         drawn = plain(types, sample.pdf)
         smooth = plain(types, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
-        share = dr.select(drawn > 0, through(omega) * dr.select(smooth, 1, drawn / (drawn + environment.density(omega))), 0)
-        for c, (value, light) in enumerate(zip(channels(types, weight), environment.radiance(omega), strict=True)):
+        share, origin = through(omega)
+        share = dr.select(drawn > 0, share * dr.select(smooth, 1, drawn / (drawn + source.density(omega))), 0)
+        for c, (value, light) in enumerate(zip(channels(types, weight), source.arriving(origin, omega, numbers), strict=True)):
             total[c] += value * light * share
     return [dr.select(plain(types, valid), value, 0) for value in total]
+
+
+def reflected_from_cloud(
+    cloud: Cloud, lights: Lights, interaction: Any, weight: Any, numbers: Stratified, counts: Counts
+) -> list[Any]:
+    """Radiance that surfaces send back of the light the cloud throws on them: one ray into the cloud a lane.
+
+    Parameters
+    ----------
+    cloud, lights
+        the medium and what lights it.
+    interaction
+        Mitsuba's surface interactions, one a lane.
+    weight
+        Float: how much of the result counts in the image; 0 leaves a lane out.
+    numbers
+        random numbers of the lanes.
+    counts
+        is updated.
+
+    Notes
+    -----
+    The ray's direction comes from the BSDF or, as often, from the cone around the sphere that encloses the cloud's box; both are
+    weighted by the density of the mixture (Veach and Guibas 1995).
+    """
+    mi, types = mitsuba(), cloud.field.types
+    context = mi.BSDFContext()
+    bsdf, valid = interaction.bsdf(), interaction.is_valid()
+    lower, upper = cloud.field.volume.bounds
+    radius = dr.opaque(types.Float, 0.5 * float(np.linalg.norm(upper - lower)))
+    axis = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper))) - plain(types, interaction.p)
+    distance = dr.norm(axis)
+    axis = axis / dr.maximum(distance, 1e-20)
+    # From inside of the sphere the cone is the whole sphere of directions.
+    widest = dr.select(distance > radius, dr.safe_sqrt(1 - dr.square(radius / distance)), -1.0)
+    of_cone = dr.rcp(2 * dr.pi * dr.maximum(1 - widest, 1e-7))
+
+    pick = numbers.number(stratified.SURFACE_W)
+    u, v = numbers.number(stratified.SURFACE_U), numbers.number(stratified.SURFACE_V)
+    aim = pick < 0.5
+    rest = dr.minimum(dr.select(aim, 2 * pick, 2 * pick - 1), 0.99999994)
+    # Around the axis: cosine uniform between that of the cone's edge and 1.
+    aimed = rotate_to(axis, 1 - u * (1 - widest), 2 * dr.pi * v)
+    sample, sampled = bsdf.sample(context, interaction, mi.Float(rest), mi.Point2f(u, v), valid)
+    omega = dr.select(aim, aimed, plain(types, interaction.to_world(sample.wo)))
+    local = interaction.to_local(mi.Vector3f(omega))
+    density = 0.5 * plain(types, bsdf.pdf(context, interaction, local, valid)) + dr.select(dr.dot(omega, axis) >= widest, 0.5 * of_cone, 0)
+    # A mirror's direction has no density: it is taken as often as the BSDF is asked, half of the time.
+    mirror = ~aim & plain(types, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
+    smooth = channels(types, bsdf.eval(context, interaction, local, valid))
+    throughput = [
+        dr.select(mirror, 2 * direct, dr.select(density > 0, value / dr.maximum(density, 1e-20), 0))
+        for direct, value in zip(channels(types, sampled), smooth, strict=True)
+    ]
+    most = throughput[0]
+    for value in throughput[1:]:
+        most = dr.maximum(most, value)
+    ray = interaction.spawn_ray(mi.Vector3f(omega))
+    end = plain(types, lights.shade.surfaces.ray_intersect(ray).t)
+    light = cloud_light(
+        cloud, lights, plain(types, ray.o), omega, end, numbers, counts, dr.select(plain(types, valid), most * weight, 0)
+    )
+    return [t * (s + j) for t, s, j in zip(throughput, light.direct, light.indirect, strict=True)]
+
+
+class Reflectors:
+    """The surfaces around a cloud as a light source: what they reflect of the direct light reaches the cloud's samples.
+
+    Directions are drawn from a table of what the surfaces look like from the middle of the cloud's box; the radiance itself is that of the
+    surface seen from the sample.
+
+    Parameters
+    ----------
+    cloud, lights
+        what dims the light on its way to the surfaces, and the lights.
+    seed
+        32 bits, of the table's random numbers.
+    """
+
+    def __init__(self, cloud: Cloud, lights: Lights, seed: int) -> None:
+        self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
+        self._table = Environment(self._types, self._nothing, self._probe(seed))
+        self.sample, self.density = self._table.sample, self._table.density
+
+    def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
+        """Radiance of the surface seen from `points`, 0 where there is none; see `LightSource`."""
+        mi = mitsuba()
+        ray = mi.Ray3f(mi.Point3f(points), mi.Vector3f(direction))
+        interaction = self._lights.shade.surfaces.ray_intersect(ray)
+        return reflected(self._cloud, self._lights, interaction, numbers.unrelated())
+
+    def _nothing(self, direction: Any) -> list[Any]:
+        return [dr.zeros(self._types.Float, dr.width(direction)) for _ in self._cloud.albedo]
+
+    def _probe(self, seed: int) -> NDArray[np.float64]:
+        types: ModuleType = self._types
+        rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
+        lower, upper = self._cloud.field.volume.bounds
+        middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
+        total = np.zeros((rows, columns))
+        random = np.random.default_rng(seed)
+        n = rows * columns
+        for part in range(_PROBE_PARTS):
+            place = random.random(2)
+            local = directions_of_cells(rows, columns, (float(place[0]), float(place[1]))).reshape(-1, 3).astype(np.float32)
+            direction = types.Array3f(*(types.Float(np.ascontiguousarray(local[:, c])) for c in range(3)))
+            numbers = Stratified(
+                types, dr.arange(types.UInt32, n), dr.full(types.UInt32, part, n), types.UInt32(_PROBE_PARTS), dr.opaque(types.UInt32, seed)
+            )
+            points = dr.zeros(types.Array3f, n) + middle
+            total += luminance(self.arriving(points, direction, numbers), n).reshape(rows, columns)
+        return total / _PROBE_PARTS

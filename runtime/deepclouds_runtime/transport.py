@@ -8,8 +8,8 @@ directions drawn from environments.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
-from types import ModuleType
 from typing import Any
 
 import drjit as dr
@@ -19,8 +19,7 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import distance_at, optical_depth
 from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
 from deepclouds_runtime import stratified
-from deepclouds_runtime._mitsuba import mitsuba, plain
-from deepclouds_runtime.lights import Environment
+from deepclouds_runtime.lights import LightSource, Shade
 from deepclouds_runtime.scattering import MultipleScattering
 from deepclouds_runtime.scene import Sun
 from deepclouds_runtime.stratified import Stratified
@@ -65,29 +64,21 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Lights:
-    """Every light of a scene: suns, environments with the number of directions drawn from each a sample, and what casts shadows.
+    """Every light of a scene.
 
     Parameters
     ----------
     suns
         directional lights.
-    environments
-        pairs of an environment and how many directions a sample draws from it.
-    surfaces
-        Mitsuba scene of the opaque surfaces, or None.
+    sources
+        pairs of a light from many directions and how many of them a sample draws.
+    shade
+        what the surfaces keep away from the suns.
     """
 
-    suns: tuple[Sun, ...] = ()
-    environments: tuple[tuple[Environment, int], ...] = ()
-    surfaces: Any = None
-
-    def visible(self, types: ModuleType, points: Any, directions: Any) -> Any:
-        """Whether no surface stands between the points and what lies in these directions."""
-        if self.surfaces is None:
-            return types.Bool(True)
-        mi = mitsuba()
-        ray = mi.Ray3f(mi.Point3f(points), mi.Vector3f(directions))
-        return ~plain(types, self.surfaces.ray_test(ray))
+    suns: tuple[Sun, ...]
+    sources: tuple[tuple[LightSource, int], ...]
+    shade: Shade
 
 
 @dataclass
@@ -112,7 +103,7 @@ def depth_of(hidden: Any) -> Any:
 
 
 def cloud_light(
-    cloud: Cloud, lights: Lights, origin: Any, direction: Any, end: Any, numbers: Stratified, counts: Counts, active: Any = True
+    cloud: Cloud, lights: Lights, origin: Any, direction: Any, end: Any, numbers: Stratified, counts: Counts, weight: Any = None
 ) -> CloudLight:
     """Light that the cloud sends back along rays, and what it hides.
 
@@ -128,13 +119,15 @@ def cloud_light(
         random numbers of the lanes.
     counts
         is updated.
-    active
-        lanes that carry a ray.
+    weight
+        Float: how much of what a ray brings counts in the image (default 1). It thins the queries out, and does NOT scale the result;
+        rays of weight 0 are not traced.
     """
     types, medium = cloud.field.types, cloud.field
+    weight = types.Float(1) if weight is None else weight
     n = dr.width(origin, direction, end)
     jitter = numbers.number(stratified.MARCH)
-    tau = optical_depth(medium, origin, direction, types.Float(0), end, jitter, types.Bool(active))
+    tau = optical_depth(medium, origin, direction, types.Float(0), end, jitter, weight > 0)
     opacity = opacity_of(tau)
     target = depth_of(numbers.number(stratified.DEPTH) * opacity)
     distance, _ = distance_at(medium, origin, direction, types.Float(0), end, jitter, target, tau > 0)
@@ -150,7 +143,7 @@ def cloud_light(
     take = _taker(types, lanes)
     d = take(direction)
     points = dr.fma(d, take(distance), take(origin))
-    _scatter(cloud, lights, points, d, take(opacity), numbers.take(lanes), counts, lanes, result)
+    _scatter(cloud, lights, points, d, take(opacity), take(weight), numbers.take(lanes), counts, lanes, result)
     return result
 
 
@@ -164,7 +157,16 @@ def _taker(types: ModuleType, lanes: Any) -> Any:
 
 
 def _scatter(
-    cloud: Cloud, lights: Lights, points: Any, w: Any, opacity: Any, numbers: Stratified, counts: Counts, lanes: Any, result: CloudLight
+    cloud: Cloud,
+    lights: Lights,
+    points: Any,
+    w: Any,
+    opacity: Any,
+    importance: Any,
+    numbers: Stratified,
+    counts: Counts,
+    lanes: Any,
+    result: CloudLight,
 ) -> None:
     """Add single and multiple scattering at `points` to the lanes of `result`, for every light."""
     types, medium = cloud.field.types, cloud.field
@@ -174,7 +176,7 @@ def _scatter(
     direct = [dr.zeros(types.Float, len(lanes)) for _ in range(channel_count)]
     jitter = numbers.number(stratified.SHADOW)
     # Which samples are worth a query is the same for all lights: one that lies in a thin place is so for each of them.
-    keep = dr.minimum(opacity * (1 / _ROULETTE), 1)
+    keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
     asked = numbers.number(stratified.ROULETTE) < keep
     queries = dr.compress(asked) if cloud.scattering is not None else types.UInt32()
     weight = dr.gather(types.Float, opacity / keep, queries)
@@ -184,11 +186,10 @@ def _scatter(
     def light(omega: Any, radiance: list[Any], share: Any) -> None:
         """One direction: `radiance` is what arrives over the density of the direction (the irradiance, of a sun)."""
         tau = optical_depth(medium, points, omega, types.Float(0), dr.largest(types.Float), jitter, types.Bool(True), _DEEP)
-        seen = lights.visible(types, points, omega)
-        single = dr.select(seen, hg(dr.dot(w, omega), g) * dr.exp(-tau), 0) * share
+        single = hg(dr.dot(w, omega), g) * dr.exp(-tau) * share
         for c in range(channel_count):
             direct[c] += albedo[c] * radiance[c] * single
-        dr.eval(tau, direct)
+        dr.eval(tau, direct, radiance)
         if cloud.scattering is not None and len(queries):
             different = tuple(sorted(set(cloud.albedo)))
             counts.queries += len(queries) * len(different)
@@ -201,23 +202,21 @@ def _scatter(
 
     for sun in lights.suns:
         omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
-        light(omega, [dr.opaque(types.Float, e) for e in sun.irradiance], 1)
-    for environment, directions in lights.environments:
+        seen = lights.shade.visible(points, omega)
+        light(omega, [dr.select(seen, dr.opaque(types.Float, e), 0) for e in sun.irradiance], 1)
+    for source, directions in lights.sources:
         for k in range(directions):
-            omega, density = environment.sample(
-                numbers.number(stratified.LIGHT_U, k, directions), numbers.number(stratified.LIGHT_V, k, directions)
-            )
-            phase_density = hg(dr.dot(w, omega), g)
-            radiance = [v / (density * directions) for v in environment.radiance(omega)]
-            light(omega, radiance, density / (density + phase_density))
-            # The other half of the pair: a direction from the phase function, which finds what a smooth sky hides from the table.
-            cosine = sample_hg_cosine(numbers.number(stratified.PHASE_U, k, directions), g)
-            omega = rotate_to(w, cosine, 2 * dr.pi * numbers.number(stratified.PHASE_V, k, directions))
-            phase_density = hg(cosine, g)
+            numbers_of = functools.partial(numbers.number, part=k, parts=directions)
+            omega, density = source.sample(numbers_of(stratified.LIGHT_U), numbers_of(stratified.LIGHT_V))
+            radiance = [v / (density * directions) for v in source.arriving(points, omega, numbers)]
+            light(omega, radiance, density / (density + hg(dr.dot(w, omega), g)))
+            # The other half of the pair: a direction from the phase function, for a strong peak that the source's table knows nothing of.
+            cosine = sample_hg_cosine(numbers_of(stratified.PHASE_U), g)
+            omega = rotate_to(w, cosine, 2 * dr.pi * numbers_of(stratified.PHASE_V))
+            drawn = hg(cosine, g)
             tau = optical_depth(medium, points, omega, types.Float(0), dr.largest(types.Float), jitter, types.Bool(True))
-            share = phase_density / (phase_density + environment.density(omega)) * (1.0 / directions)
-            share = dr.select(lights.visible(types, points, omega), share * dr.exp(-tau), 0)
-            for c, value in enumerate(environment.radiance(omega)):
+            share = drawn / (drawn + source.density(omega)) * (1.0 / directions) * dr.exp(-tau)
+            for c, value in enumerate(source.arriving(points, omega, numbers)):
                 direct[c] += albedo[c] * value * share
             dr.eval(direct)
     for c in range(channel_count):

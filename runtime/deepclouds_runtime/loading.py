@@ -1,0 +1,118 @@
+"""From a file or a loaded scene to a `Renderer`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from deepclouds.errors import InputError
+from deepclouds.volume import read_volume
+from deepclouds_runtime._mitsuba import mitsuba
+from deepclouds_runtime.renderer import Renderer
+from deepclouds_runtime.scattering import Predicts
+from deepclouds_runtime.scene import CloudScene, read_scene
+from deepclouds_runtime.volume_scene import options_from, volume_scene
+
+# How a render is done, whatever the input.
+RENDER_OPTIONS = ("multiple", "environment_directions", "interreflection")
+SCENE_OPTIONS = ("sensor", "max_depth", "hide_emitters")
+
+
+def load(
+    source: Any,
+    *,
+    defines: Mapping[str, str] | None = None,
+    model: str | PathLike[str] | None = None,
+    predictor: Predicts | None = None,
+    threads: int | None = None,
+    grid: str | None = None,
+    clamp: bool = False,
+    **options: Any,
+) -> Renderer:
+    """Load what can be rendered.
+
+    Parameters
+    ----------
+    source
+        a path to a Mitsuba scene (.xml) or a volume (.vdb, .vol), or a ``mitsuba.Scene`` that is loaded already.
+    defines
+        values for the parameters (``$name``) of a Mitsuba scene file.
+    model
+        path of the network; None takes the one that comes with the package.
+    predictor
+        any object with ``predict``, in place of `model`.
+    threads
+        threads for everything; None takes all cores.
+    grid, clamp
+        name of the grid in a .vdb file; set negative values and NaN to 0.
+    **options
+        for a volume: the fields of `deepclouds_runtime.volume_scene.VolumeOptions`; for a scene: ``sensor``, ``max_depth``,
+        ``hide_emitters``; for both: ``multiple``, ``environment_directions``, ``interreflection`` (see `Renderer`).
+
+    Returns
+    -------
+    Renderer
+
+    Raises
+    ------
+    InputError
+        for missing or malformed files, options that do not fit, and everything the readers refuse.
+
+    Notes
+    -----
+    Given a path while no Mitsuba variant is set, it sets ``llvm_ad_rgb``; a variant that is set is kept.
+    """
+    started = time.perf_counter()
+    # A missing file is worth knowing before seconds of start-up.
+    is_path = isinstance(source, str | PathLike)
+    path = Path(source) if is_path else None
+    if path is not None and not path.is_file():
+        raise InputError(f"{path}: no such file")
+    how = {name: options.pop(name) for name in RENDER_OPTIONS if name in options}
+    mitsuba(select=is_path)
+    if threads is not None:
+        _set_threads(threads)
+    scene = _scene(source, path, dict(defines or {}), grid, clamp, options)
+    if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
+        from deepclouds_runtime.predictor import Predictor
+
+        predictor = Predictor(model, threads)
+    return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)
+
+
+def _set_threads(threads: int) -> None:
+    import drjit as dr
+
+    if threads < 1:
+        raise InputError(f"threads = {threads}: at least one is needed")
+    dr.set_thread_count(threads)
+
+
+def _scene(source: Any, path: Path | None, defines: dict[str, str], grid: str | None, clamp: bool, options: dict[str, Any]) -> CloudScene:
+    if path is not None and path.suffix.lower() in (".vdb", ".vol"):
+        if defines:
+            raise InputError(f"{path}: -D{next(iter(defines))} has no meaning for a volume; it sets a parameter of a scene file")
+        return volume_scene(read_volume(path, grid, clamp), options_from(options), str(path))
+    if path is not None and path.suffix.lower() != ".xml":
+        raise InputError(f"{path}: deepclouds renders Mitsuba scenes (.xml) and volumes (.vdb, .vol), not '{path.suffix}'")
+    unknown = sorted(set(options) - set(SCENE_OPTIONS))
+    if unknown:
+        raise InputError(f"{path or 'the scene'}: the option '{unknown[0]}' belongs to a volume; a scene says it itself")
+    if grid is not None or clamp:
+        raise InputError(f"{path or 'the scene'}: grid and clamp belong to a volume; a scene says itself what it reads")
+    return read_scene(source if path is None else load_xml(path, defines), **options)
+
+
+def load_xml(path: Path, defines: dict[str, str]) -> Any:
+    """Mitsuba's scene from a file; raises InputError in place of Mitsuba's own errors."""
+    mi = mitsuba()
+    try:
+        return mi.load_file(str(path), **{name: str(value) for name, value in defines.items()})
+    except (RuntimeError, TypeError) as error:
+        message = " ".join(str(error).split())
+        if "unused parameters" in message:
+            raise InputError(f"{path}: the scene has no such parameter: {message.rpartition('parameters:')[2].strip(' -')}; leave it out") from error
+        raise InputError(f"{path}: Mitsuba cannot load the scene: {message}") from error

@@ -1,0 +1,52 @@
+"""A render as files: every channel and its settings in an EXR, a preview as PNG."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from deepclouds.exr import write_exr, write_png
+from deepclouds_runtime.renderer import RenderResult
+
+ATTRIBUTE = "deepclouds"
+
+
+def save(
+    result: RenderResult,
+    path: str | PathLike[str],
+    settings: Mapping[str, Any] | None = None,
+    png: str | PathLike[str] | None = None,
+    exposure: float = 0.0,
+) -> None:
+    """Write a render.
+
+    Parameters
+    ----------
+    result
+        what to write.
+    path
+        the .exr: float32, linear Rec. 709, all channels of `RenderResult.channels`.
+    settings
+        how it was made; stored as JSON in the header's attribute ``deepclouds``, with the model's hash on its own as ``modelHash``.
+    png
+        the preview, when wanted; `exposure` in stops.
+
+    Raises
+    ------
+    InputError
+        when a folder is missing or the image is not finite.
+    """
+    record = {k: v for k, v in (settings or {}).items() if v is not None}
+    attributes: dict[str, str | float | int] = {
+        "software": "deepclouds",
+        ATTRIBUTE: json.dumps({**record, "seconds": {k: round(v, 4) for k, v in result.seconds.items()}, "notes": list(result.notes)}),
+    }
+    if "model_hash" in record:
+        attributes["modelHash"] = str(record["model_hash"])
+    write_exr(path, {name: np.asarray(values) for name, values in result.channels.items()}, attributes)
+    if png is not None:
+        write_png(png, result.rgb, exposure)

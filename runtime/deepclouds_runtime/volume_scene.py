@@ -1,0 +1,265 @@
+"""A scene around a volume from a file: camera framed on the cloud, a sun, a sky."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.errors import InputError
+from deepclouds.volume import Volume
+from deepclouds_runtime._mitsuba import mitsuba
+from deepclouds_runtime.scene import CloudScene, check_depth, read_lights
+
+_FOV = 30.0
+_MARGIN = 1.08
+_DEFAULT_OPTICAL_DEPTH = 60.0
+_DEFAULT_SUN = (50.0, 40.0)
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """How a bare volume is lit and seen; angles in degrees.
+
+    Parameters
+    ----------
+    optical_depth
+        of the densest line along the longest axis of the grid's box; 60 when `extinction` is not given either.
+    extinction
+        extinction at density 1, 1 / world length; excludes `optical_depth`.
+    albedo
+        single-scattering albedo: one value, or one for R, G and B.
+    g
+        Henyey-Greenstein parameter.
+    sun
+        azimuth and elevation of the sun. With ``up = "y"`` azimuth 0 is +Z and grows toward +X; with ``up = "z"`` it is +X and grows
+        toward +Y. By default (50, 40), or no sun when `env` is given.
+    irradiance
+        of the sun, perpendicular to it: one value or three.
+    env
+        an environment map (latitude-longitude, .exr or .hdr) that lights the cloud and stands behind it.
+    sky
+        radiance of a uniform sky, one value or three, without `env`.
+    up
+        the axis that points up, ``"y"`` or ``"z"``.
+    view
+        azimuth and elevation of the camera as seen from the cloud, measured like those of the sun.
+    size
+        width and height of the image in pixels.
+    spp
+        samples a pixel when a render does not say.
+    hide_emitters
+        black behind the cloud in place of the sky.
+    max_depth
+        -1 for all orders of scattering, 2 for single scattering alone.
+    """
+
+    optical_depth: float | None = None
+    extinction: float | None = None
+    albedo: tuple[float, ...] = (1.0,)
+    g: float = 0.85
+    sun: tuple[float, float] | None = None
+    irradiance: tuple[float, ...] = (6.0,)
+    env: str | None = None
+    sky: tuple[float, ...] = (0.14, 0.26, 0.5)
+    up: str = "y"
+    view: tuple[float, float] = (0.0, 5.0)
+    size: tuple[int, int] = (640, 480)
+    spp: int = 32
+    hide_emitters: bool = False
+    max_depth: int = -1
+
+
+NAMES = tuple(f.name for f in fields(VolumeOptions))
+
+
+def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudScene:
+    """Light `volume` and put a camera before it.
+
+    Parameters
+    ----------
+    volume
+        the density.
+    options
+        see `VolumeOptions`.
+    source
+        the file, for messages.
+
+    Raises
+    ------
+    InputError
+        for values outside of their range, a missing environment map, and an optical depth asked of an empty volume.
+    """
+    _check(options)
+    mi = mitsuba()
+    scale = _extinction(volume, options, source)
+    description: dict[str, Any] = {"type": "scene", "camera": _camera(volume, options)}
+    sun = options.sun if options.sun is not None or options.env is not None else _DEFAULT_SUN
+    if sun is not None and max(options.irradiance) > 0:
+        description["sun"] = {
+            "type": "directional",
+            "direction": (-_direction(sun, options.up)).tolist(),
+            "irradiance": {"type": "rgb", "value": list(_three(options.irradiance))},
+        }
+    if options.env is not None:
+        if not Path(options.env).is_file():
+            raise InputError(f"{options.env}: no such environment map")
+        # Mitsuba's maps have +Y up; a quarter turn about X stands them upright where +Z is up.
+        stand = mi.ScalarTransform4f().rotate([0, 0, 1], 90).rotate([1, 0, 0], 90) if options.up == "z" else mi.ScalarTransform4f()
+        description["sky"] = {"type": "envmap", "filename": options.env, "to_world": stand}
+    elif max(options.sky) > 0:
+        description["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": list(_three(options.sky))}}
+    try:
+        scene = mi.load_dict(description)
+    except RuntimeError as error:
+        raise InputError(f"{source}: Mitsuba cannot build the scene around it ({error})") from error
+    suns, environment = read_lights(scene)
+    channels = len(mi.Spectrum())
+    albedo = _three(options.albedo) if channels == 3 else (float(np.dot(_three(options.albedo), (0.2126, 0.7152, 0.0722))),)
+    return CloudScene(
+        volume,
+        scale,
+        albedo,
+        options.g,
+        suns,
+        environment,
+        None,
+        scene.sensors()[0],
+        options.hide_emitters,
+        check_depth(options.max_depth),
+    )
+
+
+def _three(values: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(float(v) for v in (values * 3 if len(values) == 1 else values))
+
+
+def _check(options: VolumeOptions) -> None:
+    def refuse(name: str, remedy: str) -> None:
+        raise InputError(f"{name} = {getattr(options, name)}: {remedy}")
+
+    for name in ("albedo", "irradiance", "sky"):
+        values = getattr(options, name)
+        if len(values) not in (1, 3) or not np.all(np.isfinite(values)) or min(values) < 0:
+            refuse(name, "one or three numbers that are not negative")
+    if max(options.albedo) > 1:
+        refuse("albedo", "values lie in 0 to 1")
+    if not -1 < options.g < 1:
+        refuse("g", "a value between -1 and 1, both excluded")
+    if options.up not in ("y", "z"):
+        refuse("up", "'y' or 'z'")
+    for name in ("optical_depth", "extinction"):
+        value = getattr(options, name)
+        if value is not None and not (np.isfinite(value) and value >= 0):
+            refuse(name, "a finite number that is not negative")
+    if options.optical_depth is not None and options.extinction is not None:
+        raise InputError("optical_depth and extinction are both given: each sets the density's scale; leave one out")
+    if min(options.size) < 1 or len(options.size) != 2:
+        refuse("size", "width and height of at least one pixel")
+    for name in ("sun", "view"):
+        value = getattr(options, name)
+        if value is not None and (len(value) != 2 or not np.all(np.isfinite(value))):
+            refuse(name, "azimuth and elevation in degrees")
+
+
+def _extinction(volume: Volume, options: VolumeOptions, source: str) -> float:
+    if options.extinction is not None:
+        return options.extinction
+    depth = _DEFAULT_OPTICAL_DEPTH if options.optical_depth is None else options.optical_depth
+    edges = volume.voxel_size
+    axis = int(np.argmax(edges * volume.resolution))
+    line = float(volume.density.sum(axis=2 - axis, dtype=np.float64).max() * edges[axis])
+    if line == 0:
+        if options.optical_depth is None:
+            return 0.0
+        raise InputError(f"{source}: the volume is empty, so no extinction gives it an optical depth of {depth:g}")
+    return depth / line
+
+
+def _axes(up: str) -> NDArray[np.float64]:
+    """Rows: the directions of azimuth 0, of azimuth 90 degrees, and up."""
+    return np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]] if up == "y" else [[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+
+
+def _direction(angles: tuple[float, float], up: str) -> NDArray[np.float64]:
+    """Unit vector toward azimuth and elevation, degrees."""
+    azimuth, elevation = np.deg2rad(angles)
+    components = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    vector: NDArray[np.float64] = components @ _axes(up)
+    return vector
+
+
+def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
+    """Perspective camera as near as the box around the filled voxels allows."""
+    mi = mitsuba()
+    toward = _direction(options.view, options.up)
+    forward = -toward
+    up = _axes(options.up)[2]
+    if abs(up @ toward) > 0.9999:
+        up = _axes(options.up)[0]
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    above = np.cross(right, forward)
+    corners = _filled_corners(volume)
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    relative = corners - middle
+    width, height = options.size
+    tangent = np.tan(np.deg2rad(_FOV / 2))
+    # Mitsuba's fov spans the larger side with fov_axis = larger.
+    tan_x, tan_y = tangent * width / max(width, height), tangent * height / max(width, height)
+    reach = np.maximum(np.abs(relative @ right) / tan_x, np.abs(relative @ above) / tan_y)
+    distance = float((_MARGIN * reach - relative @ forward).max())
+    film = {
+        "type": "hdrfilm",
+        "width": int(width),
+        "height": int(height),
+        "rfilter": {"type": "box"},
+        "component_format": "float32",
+    }
+    return {
+        "type": "perspective",
+        "fov": _FOV,
+        "fov_axis": "larger",
+        "near_clip": 1e-4 * distance,
+        "far_clip": 1e3 * distance,
+        "to_world": mi.ScalarTransform4f().look_at(
+            origin=(middle + toward * distance).tolist(), target=middle.tolist(), up=up.tolist()
+        ),
+        "film": film,
+        "sampler": {"type": "independent", "sample_count": int(options.spp)},
+    }
+
+
+def _filled_corners(volume: Volume) -> NDArray[np.float64]:
+    """World corners of the box around the filled voxels, or of the whole box when all are empty."""
+    lowest, highest = np.zeros(3), np.array(volume.resolution, np.float64)
+    filled = volume.density > 0
+    if filled.any():
+        for axis in range(3):
+            places = np.flatnonzero(filled.any(axis=tuple(a for a in range(3) if a != 2 - axis)))
+            lowest[axis], highest[axis] = places[0], places[-1] + 1
+    unit = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, highest, lowest) / np.array(volume.resolution)
+    corners: NDArray[np.float64] = unit @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
+    return corners
+
+
+def options_from(given: dict[str, Any]) -> VolumeOptions:
+    """Build options from keyword arguments, accepting single numbers where tuples stand.
+
+    Raises
+    ------
+    InputError
+        for an unknown name.
+    """
+    unknown = sorted(set(given) - set(NAMES))
+    if unknown:
+        raise InputError(f"unknown option '{unknown[0]}' for a volume; there are: {', '.join(NAMES)}")
+    values = dict(given)
+    for name in ("albedo", "irradiance", "sky"):
+        if name in values:
+            values[name] = tuple(np.atleast_1d(np.asarray(values[name], np.float64)).tolist())
+    return dataclasses.replace(VolumeOptions(), **values)
