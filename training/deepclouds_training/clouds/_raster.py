@@ -14,6 +14,8 @@ from deepclouds.volume import Volume
 _FLOOR = 2e-3
 # Resolution of the first pass, which only looks for the cloud's bounds.
 _SCOUT = 56
+# Grids coarser than this are averaged down from finer ones.
+_FINE_ENOUGH = 48
 # Fewer voxels than this are not a cloud.
 _FEWEST = 8
 
@@ -98,8 +100,12 @@ def rasterise(field: Field, resolution: int, voxel_aspect: float) -> Volume | No
     counts = np.clip(np.rint(sides / h).astype(np.int64), 1, resolution - 2 * margin) + 2 * margin
     # Axes that are cut keep their exact extent; the others keep the voxel's shape and grow their margin by what rounding leaves.
     middle, half = (lower + upper) / 2, np.where(cut, (upper - lower) / 2, counts * h * shape / 2)
-    grid = Grid.over(middle - half, middle + half, counts)
-    values = field.evaluate(grid).astype(np.float32)
+    # A coarse grid could step over thin layers and shreds: its voxels are averages over finer samples instead.
+    finer = 1 if cut.all() else -(-_FINE_ENOUGH // resolution)
+    values = field.evaluate(Grid.over(middle - half, middle + half, counts * finer)).astype(np.float32)
+    if finer > 1:
+        nx, ny, nz = counts
+        values = values.reshape(nz, finer, ny, finer, nx, finer).mean(axis=(1, 3, 5), dtype=np.float32)
     for axis in np.flatnonzero(~cut):
         faces = np.moveaxis(values, 2 - axis, 0)
         faces[0] = 0
