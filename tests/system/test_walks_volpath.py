@@ -243,6 +243,23 @@ def test_labels_are_refused_where_they_cannot_be_formed(mi: Any) -> None:
         trace_walks_mitsuba(volume, scale, points, w, single, suns, one, 4, seed=1)
 
 
+def test_albedos_enter_both_alike() -> None:
+    """From the first order alone to the white medium, the label keeps its meaning: no power of the albedo too many or too few."""
+    volume, scale = cube()
+    n, walks = 16, 20_000
+    points, w = np.zeros((n, 3), np.float32), unit_vectors(n, 75)
+    suns = np.broadcast_to(unit_vectors(1, 76), (n, 1, 3))
+    albedos = np.broadcast_to(np.array([0.01, 0.3, 0.7, 1.0], np.float32), (n, 4))
+    single = np.full(n, 0.3, np.float32)
+    first = trace_walks(Field(backend(), volume, scale), points, w, single, suns, albedos, walks, seed=77).astype(np.float64)
+    second = trace_walks_mitsuba(volume, scale, points, w, single, suns, albedos, walks, seed=78).astype(np.float64)
+    mean = [v.mean(axis=(0, 1, 2)) for v in (first, second)]
+    error = np.sqrt(sum(v.var(axis=(0, 1, 2)) / (n * walks) for v in (first, second)))
+    assert np.all(error < 0.02 * mean[1])
+    assert np.abs((mean[0] - mean[1]) / error).max() < 4
+    assert mean[1][3] > 2 * mean[1][0]
+
+
 def test_variants_agree(mi: Any) -> None:
     """Grey stays grey: the colour variant gives what the monochromatic one gives."""
     volume, scale = cube()

@@ -87,7 +87,7 @@ def trace_walks_mitsuba(
     inside = np.all((unit > 0) & (unit < 1), axis=1)
     keys = np.array([[g[i], *suns[i, k], albedos[i, m], inside[i]] for i, k, m in jobs], np.float32)
     different, group = np.unique(keys, axis=0, return_inverse=True)
-    streams = iter(np.random.SeedSequence(seed).generate_state(len(different) + result.size // _WAVEFRONT + len(jobs), np.uint32))
+    streams = iter(np.random.SeedSequence(seed).generate_state(len(jobs), np.uint32))
     portion = max(1, _WAVEFRONT // walks)
     for index, key in enumerate(different):
         members = np.flatnonzero(group.ravel() == index)
