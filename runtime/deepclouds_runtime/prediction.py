@@ -1,0 +1,96 @@
+"""J at given points of a cloud, without a render around it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from os import PathLike, fspath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from deepclouds.volume import Volume
+    from deepclouds_runtime.scattering import Predicts
+
+
+def predict(
+    points: ArrayLike,
+    directions: ArrayLike,
+    *,
+    volume: Volume,
+    scale: float,
+    g: float,
+    albedo: float,
+    omega_sun: ArrayLike,
+    model: str | PathLike[str] | None = None,
+    predictor: Predicts | None = None,
+    backend: str = "llvm",
+) -> NDArray[np.float64]:
+    """Source term of multiple scattering over the sun's irradiance, J / E.
+
+    Parameters
+    ----------
+    points
+        (n, 3) world points.
+    directions
+        (n, 3) unit vectors w, the camera rays' travel.
+    volume
+        density and its place.
+    scale
+        extinction per unit of density, 1 / world length.
+    g
+        Henyey-Greenstein parameter.
+    albedo
+        single-scattering albedo.
+    omega_sun
+        (3,) unit vector TOWARD the sun, or (n, 3).
+    model
+        path of the network; None takes the one that comes with the package.
+    predictor
+        any object with ``predict``, in place of `model`.
+    backend
+        ``"llvm"`` or ``"cuda"``.
+
+    Returns
+    -------
+    float64 array (n,): J / E, 1 / steradian. The radiance that a path of length dt adds is ``sigma_t J dt``.
+
+    Raises
+    ------
+    InputError
+        when the model cannot be loaded or the volume is malformed.
+    ValueError
+        when shapes do not fit.
+    """
+    from deepclouds.backend import backend as types_named
+    from deepclouds.medium.field import Field
+    from deepclouds.medium.optical_depth import optical_depth
+    from deepclouds.model import multiple_scattering
+    from deepclouds_runtime.scattering import NetworkScattering
+
+    x, w = np.asarray(points, np.float32), np.asarray(directions, np.float32)
+    if x.ndim != 2 or x.shape[1] != 3 or w.shape != x.shape:
+        raise ValueError(f"points and directions need one shape (n, 3), got {x.shape} and {w.shape}")
+    suns = np.broadcast_to(np.asarray(omega_sun, np.float32), x.shape)
+    if len(x) == 0 or albedo == 0:
+        return np.zeros(len(x))
+    types = types_named(backend)
+    import drjit as dr
+
+    def upload(values: NDArray[np.float32]) -> Any:
+        return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c])) for c in range(3)))
+
+    field = Field(types, volume, scale)
+    p, d, s = upload(x), upload(w), upload(suns)
+    tau = optical_depth(field, p, s, types.Float(0), dr.largest(types.Float), types.Float(0.5), types.Bool(True), float("inf"))
+    network = predictor if predictor is not None else _predictor(None if model is None else fspath(model))
+    j = NetworkScattering(field, network)(p, d, s, g, (albedo,), tau)
+    return multiple_scattering(j[:, 0], albedo)
+
+
+@lru_cache(maxsize=1)
+def _predictor(model: str | None) -> Any:
+    from deepclouds_runtime.predictor import Predictor
+
+    return Predictor(model)
