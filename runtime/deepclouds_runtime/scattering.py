@@ -74,10 +74,13 @@ class NetworkScattering:
         if self.descriptor.empty:
             result[:] = 0
             return result
+        stencils = np.empty((min(n, _CHUNK), LEVELS, POINTS), np.float32)
         for start in range(0, n, _CHUNK):
             stop = min(start + _CHUNK, n)
             part = [_slice(self._types, v, start, stop) for v in (points, w, omega_sun)]
-            stencil = np.array(self.descriptor.stencils(*part), copy=False).reshape(-1, LEVELS, POINTS)
+            stencil = stencils[: stop - start]
+            for k, level in enumerate(self.descriptor.levels(*part)):
+                stencil[:, k] = level.numpy().reshape(-1, POINTS)
             for m, albedo in enumerate(albedos):
                 aux = aux_inputs(gamma[start:stop], g, 0.0, 1.0, albedo, depth[start:stop])
                 result[start:stop, m] = self.predictor.predict(stencil, aux)
