@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from deepclouds.errors import InputError
 from deepclouds.volume import Volume, read_vol
 
 # onnxruntime's names of value types, where they differ from numpy's.
-_NUMPY_NAMES = {"float": "float32", "double": "float64"}
 
 
 @dataclass(frozen=True)
@@ -120,10 +118,6 @@ def _density(volume: Volume) -> list[tuple[str, str]]:
 
 
 def _onnx(path: Path) -> list[Section]:
-    return _onnx_from_graph(path) if find_spec("onnx") is not None else _onnx_from_session(path)
-
-
-def _onnx_from_graph(path: Path) -> list[Section]:
     import onnx
 
     try:
@@ -145,26 +139,6 @@ def _onnx_from_graph(path: Path) -> list[Section]:
     facts += [(f"opset {o.domain or 'ai.onnx'}", str(o.version)) for o in model.opset_import]
     facts += [("nodes", str(len(model.graph.node))), ("weights", str(weights)), ("bytes", str(path.stat().st_size))]
     facts += sorted((f"metadata {m.key}", m.value) for m in model.metadata_props)
-    return [Section(path.name, facts)]
-
-
-def _onnx_from_session(path: Path) -> list[Section]:
-    import onnxruntime
-
-    try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    # onnxruntime raises a class of its own for each kind of failure, without a common base.
-    except Exception as error:
-        raise InputError(f"{path} is not a readable ONNX model: {error}") from error
-
-    def signature(value: onnxruntime.NodeArg) -> str:
-        name = value.type.removeprefix("tensor(").removesuffix(")")
-        return f"{_NUMPY_NAMES.get(name, name)} [{', '.join(map(str, value.shape))}]"
-
-    facts = [(f"input {v.name}", signature(v)) for v in session.get_inputs()]
-    facts += [(f"output {v.name}", signature(v)) for v in session.get_outputs()]
-    facts += [("opset", "install the package onnx to see it"), ("bytes", str(path.stat().st_size))]
-    facts += sorted((f"metadata {key}", value) for key, value in session.get_modelmeta().custom_metadata_map.items())
     return [Section(path.name, facts)]
 
 

@@ -121,7 +121,6 @@ def test_the_scan_finds_hidden_imports(tmp_path: Path) -> None:
 
 # Extras that a module looks for and does without: (file, package).
 OPTIONAL = {
-    ("info.py", "onnx"),
     ("compare.py", "matplotlib"),
     ("metrics.py", "flip_evaluator"),
 }
@@ -132,7 +131,8 @@ def test_what_is_imported_is_installed_without_extras(root: Path, folder: str) -
     """Rationale: a test machine has every extra, so a missing dependency would first be met by a user."""
     lines = tomllib.loads((root / "pyproject.toml").read_text())["project"]["dependencies"]
     names = {Requirement(line).name for line in lines}
-    # The one distribution whose import has another name.
-    allowed = {"PIL" if name == "pillow" else name for name in names} | sys.stdlib_module_names | {"deepclouds", "deepclouds_runtime"}
+    # Distributions whose import has another name.
+    imported_as = {"pillow": "PIL", "protobuf": "google"}
+    allowed = {imported_as.get(name, name) for name in names} | sys.stdlib_module_names | {"deepclouds", "deepclouds_runtime"}
     found = {(file.name, name.partition(".")[0]) for file in (root / folder).rglob("*.py") for name in imports(file)}
     assert not {use for use in found if use[1] not in allowed} - OPTIONAL

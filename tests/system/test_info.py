@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepclouds import info
 from deepclouds.cli import main
 from deepclouds.volume import Volume, write_vdb, write_vol
 
@@ -102,30 +101,18 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("has_onnx", [True, False])
-def test_onnx_signature_and_metadata(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, model: Path, has_onnx: bool
-) -> None:
-    """Expected: the same facts with the package onnx and without it, except those that onnxruntime does not tell."""
-    if not has_onnx:
-        monkeypatch.setattr(info, "find_spec", lambda name: None)
+def test_onnx_signature_and_metadata(capsys: pytest.CaptureFixture[str], model: Path) -> None:
     assert main(["info", str(model)]) == 0
     found = facts(capsys.readouterr().out)
     assert found["input x"] == "float32 [batch, 3]"
     assert found["output y"] == "float32 [batch, 2]"
     assert found["metadata licence"] == "CC0"
     assert found["bytes"] == str(model.stat().st_size)
-    if has_onnx:
-        assert found["opset ai.onnx"] == "17"
-        assert found["weights"] == "6"
+    assert found["opset ai.onnx"] == "17"
+    assert found["weights"] == "6"
 
 
-@pytest.mark.parametrize("has_onnx", [True, False])
-def test_onnx_refuses_what_is_no_model(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, has_onnx: bool
-) -> None:
-    if not has_onnx:
-        monkeypatch.setattr(info, "find_spec", lambda name: None)
+def test_onnx_refuses_what_is_no_model(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for content in (b"", b"not a model at all"):
         (tmp_path / "a.onnx").write_bytes(content)
         assert main(["info", str(tmp_path / "a.onnx")]) == 2
