@@ -72,7 +72,8 @@ class Predictor:
             j[rows] = self._session.run([OUTPUT], {INPUT_STENCIL: stencil[rows], INPUT_AUX: aux[rows]})[0]
         # The graph clamps its inputs, so only NaN gets through, from an input to the output or out of damaged weights.
         if not np.all(np.isfinite(j)):
-            raise ValueError(f"{np.count_nonzero(~np.isfinite(j))} of {n} predictions of {self.path} are not finite; check the inputs for NaN")
+            bad = np.count_nonzero(~np.isfinite(j))
+            raise ValueError(f"{bad} of {n} predictions of {self.path} are not finite; check the inputs for NaN")
         return j
 
     def out_of_range(self, aux: NDArray[np.float32]) -> dict[str, int]:

@@ -143,7 +143,8 @@ class SampleSource:
         aux = aux_inputs(angle_between(w, sun), shard.g[i], zero, one, shard.albedo[i, m], shard.tau_sun[i, k])
         label, error = shard.label[i, k, m], shard.error[i, k, m]
         if not (np.all(np.isfinite(label)) and np.all(np.isfinite(error)) and np.all(np.isfinite(stencil))):
-            raise InputError(f"{self.dataset.folder / info.file}: labels or stencils are not finite; delete the shard and generate it again")
+            path = self.dataset.folder / info.file
+            raise InputError(f"{path}: labels or stencils are not finite; delete the shard and generate it again")
         return Samples(stencil, aux, label, error, np.full(queries, info.index, np.int64))
 
     def _turn(self, position: int) -> tuple[int, int]:

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
-from deepclouds.model import AUX
 from deepclouds_training.average import WeightAverage
 from deepclouds_training.loss import relative_squared_error
 from deepclouds_training.network import Network

@@ -24,8 +24,8 @@ class Figures:
         sqrt(mean(((p - y)^2 - e^2) / (p + 0.05)^2)): every sample counts alike.
     energy
         sum(p) / sum(y) - 1.
-    energy_dark
-        the same over the third of the samples with the smallest predictions.
+    calibration_dark
+        the same over the third of the samples with the smallest predictions: 0 where the prediction is the mean of what it stands for.
     """
 
     samples: int
@@ -37,7 +37,7 @@ class Figures:
     energy: float
     energy_low: float
     energy_high: float
-    energy_dark: float
+    calibration_dark: float
 
     def as_dict(self) -> dict[str, float]:
         """The figures by name."""
@@ -76,7 +76,7 @@ def figures(
         energy=float(_energy(total)[0]),
         energy_low=float(energy_low),
         energy_high=float(energy_high),
-        energy_dark=float(_ratio(p[dark].sum(), y[dark].sum()) - 1),
+        calibration_dark=float(_ratio(p[dark].sum(), y[dark].sum()) - 1),
     )
 
 
@@ -96,7 +96,9 @@ def figures_by_family(
     return found
 
 
-def energy_by_cloud(prediction: NDArray[np.float32], label: NDArray[np.float32], cloud: NDArray[np.int64]) -> dict[int, tuple[float, float]]:
+def energy_by_cloud(
+    prediction: NDArray[np.float32], label: NDArray[np.float32], cloud: NDArray[np.int64]
+) -> dict[int, tuple[float, float]]:
     """For every cloud sum(p) / sum(y) - 1 and its standard error (delta method)."""
     found = {}
     for number in np.unique(cloud):

@@ -1,0 +1,216 @@
+"""Training runs: resumed equals uninterrupted, interrupted runs save, bad input is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from deepclouds_training.average import WeightAverage
+from deepclouds_training.network import Network, NetworkConfig
+from deepclouds_training.run_folder import RunFolder
+from deepclouds_training.shards import open_dataset
+from deepclouds_training.train import main
+from deepclouds_training.train_config import TrainConfig, checked
+from deepclouds_training.trainer import Trainer
+
+from deepclouds.errors import InputError
+
+
+def settings(data: Path, **changes: object) -> TrainConfig:
+    values = {
+        "data": str(data),
+        "steps": 4,
+        "batch": 16,
+        "warmup": 2,
+        "valid_queries": 16,
+        "valid_every": 3,
+        "network": {"width": 8},
+        # Three batches a pool: the resumed run begins in the middle of one.
+        "samples": {"shards": 3, "queries": 16},
+    }
+    return checked({**values, **changes}, "test")
+
+
+def trainer(folder: Path, config: TrainConfig) -> Trainer:
+    dataset = open_dataset(config.data)
+    run = RunFolder(folder)
+    if not (folder / "config.json").exists():
+        run.begin(config, dataset)
+    return Trainer(config, run, dataset, run.shards(dataset))
+
+
+def after(steps: int, one: Trainer) -> Callable[[], bool]:
+    return lambda: one.step >= steps
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and torch.equal(a, b)
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple):
+        return isinstance(b, list | tuple) and len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_two_steps_and_two_more_equal_four(small_dataset: Path, tmp_path: Path, passes: int) -> None:
+    """Rationale: a run that was killed must be worth as much as one that was not.
+
+    Expected behaviour: weights, averages, optimiser, ranges and logged validation agree bit for bit.
+    """
+    config = settings(small_dataset, samples={"shards": 3, "queries": 16, "passes": passes})
+    whole = trainer(tmp_path / "whole", config)
+    assert whole.train(lambda: False)
+    first = trainer(tmp_path / "halves", config)
+    assert not first.train(after(2, first))
+    assert first.step == 2
+    second = trainer(tmp_path / "halves", config)
+    assert second.resumed
+    assert second.train(lambda: False)
+    states = [RunFolder(tmp_path / name).load_checkpoint() for name in ("whole", "halves")]
+    for state in states:
+        assert state is not None
+        assert state.pop("elapsed") > 0
+    assert same(states[0], states[1])
+    valid = [[e["figures"] for e in RunFolder(tmp_path / n).metrics() if e["kind"] == "valid"] for n in ("whole", "halves")]
+    assert valid[0] == valid[1]
+    assert len(valid[0]) == 2
+
+
+def test_a_run_says_everything_about_itself(small_dataset: Path, tmp_path: Path) -> None:
+    config = tmp_path / "run.toml"
+    config.write_text(f'data = "{small_dataset}"\nsteps = 9\nbatch = 16\n[network]\nwidth = 8\n[samples]\nshards = 2\nqueries = 16\n')
+    run = tmp_path / "run"
+    assert main([str(config), "-o", str(run), "--steps", "2", "--threads", "1"], "train") == 0
+    saved = json.loads((run / "config.json").read_text())
+    assert saved["config"]["steps"] == 2, "a flag overrides the file"
+    assert saved["config"]["network"]["width"] == 8
+    assert saved["hash"] == RunFolder(run).config().hash
+    assert json.loads((run / "environment.json").read_text())["packages"]["torch"]
+    entries = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert {e["kind"] for e in entries} == {"train", "valid"}
+    assert set(entries[-1]["figures"]) == {"all", "ring"} or set(entries[0]["figures"]) == {"all", "ring"}
+    assert (run / "predicted.png").read_bytes().startswith(b"\x89PNG")
+    assert not [p for p in run.iterdir() if p.name.startswith(".")], "no temporary files are left"
+    with pytest.raises(InputError, match="holds a run already"):
+        main([str(config), "-o", str(run)], "train")
+    assert main(["-o", str(run), "--resume", "--steps", "3"], "train") == 0
+    state = RunFolder(run).load_checkpoint()
+    assert state is not None
+    assert state["step"] == 3
+
+
+def test_sigterm_saves_and_exits_130(small_dataset: Path, tmp_path: Path, root: Path) -> None:
+    config = tmp_path / "run.toml"
+    config.write_text(f'data = "{small_dataset}"\nsteps = 1000000\nbatch = 16\n[network]\nwidth = 8\n[samples]\nshards = 2\nqueries = 16\n')
+    run = tmp_path / "run"
+    command = "import sys; from deepclouds_training.train import main; sys.exit(main(sys.argv[1:]))"
+    path = os.pathsep.join([str(root), str(root / "training"), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        [sys.executable, "-c", command, str(config), "-o", str(run), "--threads", "1"], env={**os.environ, "PYTHONPATH": path}
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while not (run / "config.json").exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert process.poll() is None, "the run ended by itself"
+        time.sleep(2)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
+        process.wait()
+    assert RunFolder(run).load_checkpoint() is not None
+
+
+def test_nan_is_refused_with_the_step(small_dataset: Path, tmp_path: Path) -> None:
+    one = trainer(tmp_path / "run", settings(small_dataset))
+    with torch.no_grad():
+        one.network.fc_1.bias.fill_(float("nan"))
+    with pytest.raises(InputError, match="loss became nan at step 0"):
+        one.train(lambda: False)
+
+
+def test_grown_data_set_is_taken_in_only_on_request(small_dataset: Path, tmp_path: Path) -> None:
+    dataset = open_dataset(small_dataset)
+    run = RunFolder(tmp_path)
+    fewer = type(dataset)(dataset.folder, dataset.manifest, dataset.shards[1:])
+    run.begin(settings(small_dataset), fewer)
+    assert run.shards(dataset) == fewer.shards
+    with pytest.raises(InputError, match="have changed"):
+        run.shards(type(dataset)(dataset.folder, dataset.manifest, dataset.shards[2:]))
+    run.adopt(dataset)
+    assert run.shards(dataset) == dataset.shards
+    assert run.data_hash == dataset.hash
+
+
+def test_schedule_follows_steps_or_minutes(small_dataset: Path, tmp_path: Path) -> None:
+    one = trainer(tmp_path / "run", settings(small_dataset, steps=100, warmup=10, learning_rate=1e-2, final_learning_rate=1e-4))
+    rates = []
+    for step in range(101):
+        one.step = step
+        rates.append(one.learning_rate())
+    assert rates[0] == pytest.approx(1e-3, rel=1e-2)
+    assert int(np.argmax(rates)) in (9, 10)
+    assert rates[100] == pytest.approx(1e-4)
+    assert all(a > b for a, b in pairwise(rates[10:]))
+    one.config = settings(small_dataset, minutes=2.0)
+    one.elapsed = 60.0
+    assert one.progress() == pytest.approx(0.5)
+
+
+def test_average_is_the_mean_without_a_start_at_zero() -> None:
+    network = Network(NetworkConfig(width=8))
+    average = WeightAverage(network, 0.9)
+    values, weights = [], []
+    for i in range(6):
+        with torch.no_grad():
+            network.head.bias.fill_(float(i**2))
+        average.update()
+        values.append(float(i**2))
+        weights.append(0.9 ** (5 - i))
+    assert float(average.averaged(network).head.bias.detach()) == pytest.approx(np.average(values, weights=weights), rel=1e-5)
+    assert float(network.head.bias.detach()) == 25.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepz = 3", "stepz"),
+        ("[network]\nwidht = 8", r"network\.widht"),
+        ("steps = 0", "steps"),
+        ("steps = ", "TOML"),
+        ("batch = 100000000", "batch"),
+    ],
+)
+def test_bad_configuration_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    config = tmp_path / "bad.toml"
+    config.write_text(f'data = "nowhere"\n{text}\n' if "TOML" not in message else text)
+    with pytest.raises(InputError, match=message) as caught:
+        main([str(config), "-o", str(tmp_path / "run")], "train")
+    assert "bad.toml" in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_things_are_named(tmp_path: Path, small_dataset: Path) -> None:
+    with pytest.raises(InputError, match=r"absent\.toml"):
+        main([str(tmp_path / "absent.toml"), "-o", str(tmp_path / "run")], "train")
+    with pytest.raises(InputError, match="not the folder of a training run"):
+        main(["-o", str(tmp_path / "run"), "--resume"], "train")
+    with pytest.raises(InputError, match="--resume"):
+        main(["-o", str(tmp_path / "run")], "train")
+    trainer(tmp_path / "damaged", settings(small_dataset))
+    (tmp_path / "damaged" / "checkpoint.pt").write_bytes(b"half a checkpoint")
+    with pytest.raises(InputError, match=r"checkpoint\.pt"):
+        main(["-o", str(tmp_path / "damaged"), "--resume"], "train")
