@@ -116,11 +116,10 @@ def _read(path: Path) -> bytes:
 def _parse(data: bytes, path: Path) -> ModelProto:
     # onnxruntime does not show a graph's initialisers, onnx does; it is imported here because nothing but loading needs it.
     import onnx
-    from google.protobuf.message import DecodeError
 
     try:
         model = onnx.load_from_string(data)
-    except DecodeError as error:
+    except Exception as error:
         raise InputError(f"{path}: not an ONNX file, or cut short; export or download it again") from error
     if not model.graph.node:
         raise InputError(f"{path}: not an ONNX file: it holds no graph; export or download it again")

@@ -19,7 +19,7 @@ class WeightAverage:
     def __init__(self, network: Network, decay: float) -> None:
         self.decay = decay
         self.updates = 0
-        self._parameters = list(network.parameters())
+        self._parameters: list[Tensor] = list(network.parameters())
         self._sums = [torch.zeros_like(p) for p in self._parameters]
 
     @torch.no_grad()

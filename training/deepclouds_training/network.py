@@ -225,13 +225,11 @@ class Network(nn.Module):
         for k, block in zip(self.sequence, self.blocks, strict=True):
             # Level by level, so that what is compressed is still in the cache when it is multiplied.
             assert isinstance(block, Block)
-            if self.is_folded:
-                weight, bias = block.stencil.weight, block.stencil.bias
-            else:
-                weight, bias = block.standardised(self.level_mean[k], self.level_scale[k])
+            plain: tuple[Tensor, Tensor] = (block.stencil.weight, block.stencil.bias)
+            weight, bias = plain if self.is_folded else block.standardised(self.level_mean[k], self.level_scale[k])
             o = block(self.compressed(levels[k], k), weight, bias, f, o)
         assert o is not None
-        hidden = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
+        hidden: Tensor = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
         hidden = F.relu(self.fc_2(torch.cat([hidden, f], dim=1)))
         return torch.exp(torch.clamp(self.head(hidden).squeeze(1), LOWEST, HIGHEST))
 

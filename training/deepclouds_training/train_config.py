@@ -62,7 +62,7 @@ class TrainConfig(BaseModel):
     network: NetworkConfig = NetworkConfig()
     samples: SampleConfig = SampleConfig()
     valid_shards: int = Field(default=48, ge=1)
-    valid_queries: int = Field(default=512, ge=2)
+    valid_queries: int = Field(default=1024, ge=2)
     valid_every: int = Field(default=1000, ge=1)
     checkpoint_seconds: float = Field(default=100.0, ge=0, le=120)
     tensorboard: bool = False

@@ -20,6 +20,8 @@ class Figures:
     ----------
     rrmse
         sqrt(mean((p - y)^2 - e^2)) / mean(y), e the label's standard error: the labels' noise drops out in expectation.
+    squared
+        mean((p - y)^2 - e^2) / mean(y)^2, the square of `rrmse` before it is kept from going negative: what to average over runs.
     relative
         sqrt(mean(((p - y)^2 - e^2) / (p + 0.05)^2)): every sample counts alike.
     energy
@@ -33,6 +35,7 @@ class Figures:
     rrmse: float
     rrmse_low: float
     rrmse_high: float
+    squared: float
     relative: float
     energy: float
     energy_low: float
@@ -61,8 +64,9 @@ def figures(
     # Sorted into thirds by the prediction, which knows nothing of the label's noise: sorting by the label would bias the sums.
     dark = p <= np.quantile(p, 1 / 3)
     sums = np.stack([np.bincount(group, weights=v) for v in (np.ones_like(p), squares, p, y)])
-    picks = rng.multinomial(sums.shape[1], np.full(sums.shape[1], 1 / sums.shape[1]), size=RESAMPLES)
-    resampled = sums @ picks.T
+    groups = sums.shape[1]
+    picks = rng.multinomial(groups, np.full(groups, 1 / groups), size=RESAMPLES).astype(np.float64)
+    resampled: NDArray[np.float64] = sums @ picks.T
     rrmse_low, rrmse_high = np.quantile(_rrmse(resampled), [0.025, 0.975])
     energy_low, energy_high = np.quantile(_energy(resampled), [0.025, 0.975])
     total = sums.sum(axis=1, keepdims=True)
@@ -72,7 +76,8 @@ def figures(
         rrmse=float(_rrmse(total)[0]),
         rrmse_low=float(rrmse_low),
         rrmse_high=float(rrmse_high),
-        relative=float(np.sqrt(max(0.0, np.mean(squares / (p + 0.05) ** 2)))),
+        squared=float(squares.mean() / max(float(y.mean()), 1e-12) ** 2),
+        relative=float(np.sqrt(max(0.0, float(np.mean(squares / (p + 0.05) ** 2))))),
         energy=float(_energy(total)[0]),
         energy_low=float(energy_low),
         energy_high=float(energy_high),
@@ -111,7 +116,8 @@ def energy_by_cloud(
 
 def _rrmse(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     count, squares, _, y = sums
-    return np.sqrt(np.maximum(0.0, squares / count)) / np.maximum(y / count, 1e-12)
+    value: NDArray[np.float64] = np.sqrt(np.maximum(0.0, squares / count)) / np.maximum(y / count, 1e-12)
+    return value
 
 
 def _energy(sums: NDArray[np.float64]) -> NDArray[np.float64]:
