@@ -41,7 +41,7 @@ class SampleConfig(BaseModel):
 
     shards: int = Field(default=32, ge=1)
     queries: int = Field(default=2048, ge=1)
-    passes: int = Field(default=1, ge=1)
+    passes: int = Field(default=2, ge=1)
     unit_jitter: float = Field(default=2.0, ge=1.0)
     mirror: bool = True
     cache_gb: float = Field(default=3.0, ge=0.0)
@@ -136,9 +136,9 @@ class SampleSource:
         w, sun = shard.w[i], shard.omega_sun[i, k]
         stencil = descriptor.stencils_numpy(shard.point[i], w, sun, azimuth)
         if mirror:
-            turned = rng.random(queries) < 0.5
-            stencil = stencil.reshape(queries, LEVELS, 9, 5, 5)
-            stencil = np.where(turned[:, None, None, None, None], stencil[..., ::-1], stencil).reshape(queries, LEVELS, POINTS)
+            turned = np.flatnonzero(rng.random(queries) < 0.5)
+            rows = stencil.reshape(queries, LEVELS, 9, 5, 5)
+            rows[turned] = rows[turned, ..., ::-1]
         one, zero = np.ones(queries), np.zeros(queries)
         aux = aux_inputs(angle_between(w, sun), shard.g[i], zero, one, shard.albedo[i, m], shard.tau_sun[i, k])
         label, error = shard.label[i, k, m], shard.error[i, k, m]
