@@ -19,6 +19,12 @@ PARALLEL_SINE = 1e-3
 _ROWS = POINTS // 5
 
 
+def default_unit(field: Field) -> float:
+    """Mean free path at the extinction-weighted mean extinction, world units; 1 for an empty field."""
+    mean = field.scale * mean_extinction(field.volume)
+    return 1.0 / mean if mean > 0 else 1.0
+
+
 class _Level:
     """One filtered level on the device; what differs between levels is opaque, so that all share one kernel."""
 
@@ -74,10 +80,9 @@ class Descriptor:
     """
 
     def __init__(self, field: Field, unit: float | None = None, origin: ArrayLike | None = None) -> None:
-        mean = field.scale * mean_extinction(field.volume)
         self.field = field
-        self.empty = mean <= 0 or field.majorant == 0.0
-        self.unit = float(unit) if unit is not None else (1.0 / mean if mean > 0 else 1.0)
+        self.empty = field.majorant == 0.0
+        self.unit = default_unit(field) if unit is None else float(unit)
         if not (math.isfinite(self.unit) and self.unit > 0):
             raise ValueError(f"the unit of length must be positive and finite, got {self.unit}")
         self._frame = volume_frame(field.volume, None if origin is None else np.asarray(origin, np.float64))

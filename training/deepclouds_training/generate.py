@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 
 # Clouds are made ahead on another process while the current one is traced.
 _AHEAD = 2
+_MITSUBA_GROUPS = 2
 
 
 class GenerateConfig(BaseModel):
@@ -152,18 +153,21 @@ def _make_shard(
     rng = plan.points
     points, w, kind = sample_points(rng, field, config.points, config.deeper, config.anywhere)
     n = len(points)
-    g = sample_g(rng, n)
-    suns = sample_suns(rng, w, config.suns)
+    # volpath needs a scene for every (g, sun, albedo): its points share a few of them.
+    own = n if tracer == "own" else min(_MITSUBA_GROUPS, n)
+    group = np.arange(n) % own
+    g = sample_g(rng, own)[group]
+    suns = sample_suns(rng, w, config.suns)[group]
     # Most clouds scatter nearly everything: half the labels have albedo 1, the others crowd toward it.
     albedo = np.ones((n, 2), np.float32)
-    albedo[:, 1] = 1 - rng.random(n) ** 2
+    albedo[:, 1] = (1 - rng.random(own) ** 2)[group]
     origin = types.Array3f(np.ascontiguousarray(np.repeat(points, config.suns, axis=0).T))
     toward = types.Array3f(np.ascontiguousarray(suns.reshape(-1, 3).T))
     tau = optical_depth(field, origin, toward, types.Float(0), types.Float(np.inf), types.Float(0.5), types.Bool(True), opaque=1e9)
     if tracer == "mitsuba":
-        from deepclouds_training.mitsuba_tracer import trace_walks as trace_mitsuba
+        from deepclouds_training.mitsuba_tracer import trace_walks_mitsuba
 
-        estimates = trace_mitsuba(field, points, w, g, suns, albedo, config.walks, plan.walk_seed)
+        estimates = trace_walks_mitsuba(volume, scale, points, w, g, suns, np.maximum(albedo, 1e-3), config.walks, plan.walk_seed)
     else:
         estimates = trace_walks(field, points, w, g, suns, albedo, config.walks, plan.walk_seed, connect=config.connect)
     label = estimates.mean(axis=1, dtype=np.float64)

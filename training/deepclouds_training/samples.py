@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from deepclouds.backend import backend
-from deepclouds.descriptor import LEVELS, POINTS, Descriptor
+from deepclouds.descriptor import LEVELS, POINTS, Descriptor, default_unit
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field as Extinction
 from deepclouds.model import AUX, aux_inputs
@@ -127,8 +127,7 @@ class SampleSource:
     def draw(self, info: ShardInfo, queries: int, rng: np.random.Generator, unit_factor: float, mirror: bool) -> Samples:
         """Random queries of one shard, stencils built with the shard's own unit of length times `unit_factor`."""
         shard, field = self._load(info)
-        own = Descriptor(field)
-        descriptor = own if unit_factor == 1.0 else Descriptor(field, unit=own.unit * unit_factor)
+        descriptor = Descriptor(field, unit=unit_factor * default_unit(field))
         i = rng.integers(0, len(shard.point), queries)
         k = rng.integers(0, shard.omega_sun.shape[1], queries)
         m = rng.integers(0, shard.albedo.shape[1], queries)

@@ -117,7 +117,8 @@ def read_shard(path: Path) -> tuple[Shard, dict[str, Any]]:
         when the file is missing, truncated or no shard.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # Opened here: numpy leaves a file of its own open when the archive in it is damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             header = json.loads(str(stored["header"]))
             volume = Volume(stored["density"].astype(np.float32), stored["to_world"])
             return Shard(volume=volume, scale=float(stored["scale"]), **{name: stored[name] for name in _ARRAYS}), header
