@@ -25,8 +25,9 @@ from pathlib import Path
 from benchmarks.equal_error import Bounded, Timing, interpolated_seconds, unbiased_seconds
 from benchmarks.worker import DEFAULT_SPP, METHODS
 from deepclouds.errors import InputError
-from deepclouds.exr import read_exr, rename_into_place
+from deepclouds.exr import read_exr
 from deepclouds.metrics import ErrorReport, error_report
+from deepclouds.replacing import replacing
 
 ROOT = Path(__file__).resolve().parent.parent
 _MARKS = ("<!-- results: written by `python -m benchmarks.bench --docs` -->", "<!-- end of results -->")
@@ -208,18 +209,15 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     names = ["method", "scene", "spp", "seconds_warm", "seconds_cold", "rrmse", "rrmse_low", "rrmse_high"]
     names += ["energy", "energy_low", "energy_high", "dark_energy", "worst_tile", "flip"]
 
-    def save(temporary: str) -> None:
-        with open(temporary, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(names)
-            for row in rows:
-                r = row.report
-                cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.6g}"
-                figures = [r.rrmse, *r.rrmse_interval, r.energy, *r.energy_interval, r.dark_energy, r.worst_tile]
-                texts = [f"{x:.6g}" for x in figures] + ["" if r.flip is None else f"{r.flip:.6g}"]
-                writer.writerow([row.method, row.scene, row.spp_text, f"{row.seconds_warm:.6g}", cold, *texts])
-
-    rename_into_place(path, ".csv", save)
+    with replacing(path, ".csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        for row in rows:
+            r = row.report
+            cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.6g}"
+            figures = [r.rrmse, *r.rrmse_interval, r.energy, *r.energy_interval, r.dark_energy, r.worst_tile]
+            texts = [f"{x:.6g}" for x in figures] + ["" if r.flip is None else f"{r.flip:.6g}"]
+            writer.writerow([row.method, row.scene, row.spp_text, f"{row.seconds_warm:.6g}", cold, *texts])
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -284,10 +282,8 @@ def write_plots(folder: Path, rows: Sequence[Row]) -> int:
         axis.grid(which="both", color="#dddddd", lw=0.5)
         axis.legend(frameon=False, fontsize=8)
 
-        def save(temporary: str, figure: Figure = figure) -> None:
+        with replacing(folder / f"bench_{scene}.png", ".png") as temporary:
             figure.savefig(temporary, format="png")
-
-        rename_into_place(folder / f"bench_{scene}.png", ".png", save)
     return len(scenes)
 
 
@@ -311,10 +307,8 @@ def write_docs(rows: Sequence[Row], table: str, docs: Path = ROOT / "docs") -> N
     body = f"\n\nMeasured on: {machine()}\n\n{ratios}\n\n{table}\n\n{pictures}\n\n"
     content = head + _MARKS[0] + body + _MARKS[1] + tail
 
-    def save(temporary: str) -> None:
-        Path(temporary).write_text(content, encoding="utf-8")
-
-    rename_into_place(page, ".md", save)
+    with replacing(page, ".md") as temporary:
+        temporary.write_text(content, encoding="utf-8")
 
 
 def _spp_list(flag: str, text: str, least: int) -> list[int]:

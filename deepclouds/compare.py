@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepclouds.errors import InputError
-from deepclouds.exr import read_exr, rename_into_place, srgb, tone_map, write_png_bytes
+from deepclouds.exr import read_exr, srgb, tone_map, write_png_bytes
 from deepclouds.metrics import ErrorReport, bright_mask, error_report, finite_image, to_reference_size
+from deepclouds.replacing import replacing
 
 
 def main(argv: Sequence[str], prog: str = "deepclouds compare") -> int:
@@ -160,7 +161,8 @@ def _map_with_matplotlib(
         axis.set_axis_off()
     bar = figure.colorbar(ScalarMappable(Normalize(-100 * limit, 100 * limit), colours), ax=axes[2])
     bar.set_label("too dark    % of the reference    too bright")
-    rename_into_place(path, ".png", lambda temporary: figure.savefig(temporary, format="png"))
+    with replacing(path, ".png") as temporary:
+        figure.savefig(temporary, format="png")
 
 
 def _map_with_pillow(path: str | os.PathLike[str], pictures: list[NDArray[np.float64]], error: NDArray[np.float64], limit: float) -> None:

@@ -6,17 +6,16 @@ OpenEXR and pillow are imported inside the functions, so that reading this modul
 from __future__ import annotations
 
 import os
-import tempfile
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.replacing import replacing
 
 # Fields every EXR header has for its own bookkeeping; all others are free attributes.
 _STRUCTURE = frozenset(
@@ -202,13 +201,10 @@ def write_exr(
             raise InputError(f"{os.fspath(path)}: attribute '{key}' = {value} does not fit 32 bits; pass it as text")
         header[key] = value
 
-    def save(temporary: str) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with openexr.File(header, pixels) as file:
-                file.write(temporary)
-
-    rename_into_place(path, ".exr", save)
+    with replacing(path, ".exr") as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with openexr.File(header, pixels) as file:
+            file.write(str(temporary))
 
 
 def write_png(path: str | os.PathLike[str], rgb: ArrayLike, exposure: float = 0.0) -> None:
@@ -257,7 +253,8 @@ def write_png_bytes(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> 
     from PIL import Image
 
     picture = Image.fromarray(pixels)
-    rename_into_place(path, ".png", lambda temporary: picture.save(temporary, format="PNG"))
+    with replacing(path, ".png") as temporary:
+        picture.save(temporary, format="PNG")
 
 
 def _openexr() -> ModuleType:
@@ -267,33 +264,3 @@ def _openexr() -> ModuleType:
         raise InputError("reading and writing .exr images needs the package 'OpenEXR': pip install OpenEXR") from error
     module: ModuleType = OpenEXR
     return module
-
-
-def rename_into_place(path: str | os.PathLike[str], suffix: str, save: Callable[[str], None]) -> None:
-    """Let `save` write to a temporary name beside `path`, then rename; a failure leaves neither file.
-
-    Raises
-    ------
-    InputError
-        when the name does not end in `suffix`, or the folder is missing or cannot be written.
-    """
-    target = Path(path)
-    if target.suffix.lower() != suffix:
-        raise InputError(f"{target}: the name must end in {suffix}")
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: the folder {target.parent} does not exist; create it first")
-    try:
-        handle, temporary = tempfile.mkstemp(suffix=suffix, prefix=f".{target.stem}.", dir=target.parent)
-        os.close(handle)
-    except OSError as error:
-        raise InputError(f"{target}: cannot write into {target.parent} ({error.strerror})") from error
-    try:
-        save(temporary)
-        # mkstemp makes files private; an image gets the permissions any new file would have.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

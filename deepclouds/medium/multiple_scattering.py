@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from deepclouds.medium.field import Field
 from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
 
+
 def trace_walks(
     field: Field,
     points: NDArray[np.float32],
@@ -118,9 +119,7 @@ def _stream(types: Any, key: Any, number: Any) -> list[Any]:
 
 
 @dr.syntax
-def _loop(
-    field: Field, queries: _Queries, walks: int, total: int, key: Any, counter: Any, result: Any, lanes: int, connect: float
-) -> None:
+def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, counter: Any, result: Any, lanes: int, connect: float) -> None:
     types = field.types
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     k_suns, m_albedos = len(queries.suns), len(queries.albedos)

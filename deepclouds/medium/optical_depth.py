@@ -17,7 +17,9 @@ TAU_OPAQUE = 20.0
 
 
 @dr.syntax
-def optical_depth(field: Field, origin: Any, direction: Any, start: Any, end: Any, jitter: Any, active: Any, opaque: float = TAU_OPAQUE) -> Any:
+def optical_depth(
+    field: Field, origin: Any, direction: Any, start: Any, end: Any, jitter: Any, active: Any, opaque: float = TAU_OPAQUE
+) -> Any:
     """Optical depth of the segments from `start` to `end` along rays, inside the box; a march stops once tau exceeds `opaque`.
 
     Parameters
@@ -53,9 +55,7 @@ def optical_depth(field: Field, origin: Any, direction: Any, start: Any, end: An
 
 
 @dr.syntax
-def distance_at(
-    field: Field, origin: Any, direction: Any, start: Any, end: Any, jitter: Any, target: Any, active: Any
-) -> tuple[Any, Any]:
+def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any, jitter: Any, target: Any, active: Any) -> tuple[Any, Any]:
     """Distance at which the optical depth from `start` reaches `target`, by the march of `optical_depth` with the same jitter.
 
     Returns the distance and the extinction there (that of the march's step); with a target beyond the segment's optical depth the

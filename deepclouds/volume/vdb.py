@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.replacing import replacing
 from deepclouds.volume import _openvdb
 from deepclouds.volume._clean import clean
-from deepclouds.volume._replacing import replacing
 from deepclouds.volume._volume import Volume
 
 MAX_VOXELS = 2**30

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from deepclouds.errors import InputError
+from deepclouds.replacing import replacing
 from deepclouds.volume._clean import clean
-from deepclouds.volume._replacing import replacing
 from deepclouds.volume._volume import Volume
 
 _HEADER = struct.Struct("<3sB5i6f")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from deepclouds.cli import main
 from deepclouds_training.generate import GenerateConfig, generate, load_config
 from deepclouds_training.shards import FIRST_COLLISION, open_dataset, read_shard
+
+from deepclouds.cli import main
 
 SMALL = GenerateConfig(seed=3, train_shards=2, valid_shards=1, points=96, suns=2, walks=4, resolution=(12, 16), size=(4.0, 12.0))
 
@@ -63,7 +63,7 @@ def test_a_second_run_keeps_finished_shards_and_mends_damaged_ones(made: Path, t
     assert main(["dataset", "verify", str(tmp_path)]) == 2
     generate(SMALL, tmp_path)
     assert main(["dataset", "verify", str(tmp_path)]) == 0
-    assert not list(tmp_path.glob("*.tmp"))
+    assert not list(tmp_path.glob(".*.tmp*"))
 
 
 def test_another_configuration_is_not_mixed_in(made: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

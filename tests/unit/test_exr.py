@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from deepclouds.errors import InputError
-from deepclouds.exr import Exr, read_exr, rename_into_place, srgb, tone_map, write_exr, write_png
+from deepclouds.exr import Exr, read_exr, srgb, tone_map, write_exr, write_png
+from deepclouds.replacing import replacing
 
 
 @pytest.fixture
@@ -136,12 +137,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, image: np.ndarray) -
     write_exr(path, layers(image))
     before = path.read_bytes()
 
-    def fail(temporary: str) -> None:
-        Path(temporary).write_bytes(b"half")
+    with pytest.raises(RuntimeError, match="disk full"), replacing(path, ".exr") as temporary:
+        temporary.write_bytes(b"half")
         raise RuntimeError("disk full")
-
-    with pytest.raises(RuntimeError, match="disk full"):
-        rename_into_place(path, ".exr", fail)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 

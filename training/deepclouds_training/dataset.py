@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from deepclouds.errors import InputError
-from deepclouds.volume._replacing import replacing
+from deepclouds.replacing import replacing
 from deepclouds_training.shards import Dataset, open_dataset, read_shard
 
 

@@ -130,7 +130,7 @@ class _Plan:
         weights = np.array([config.family_weights.get(name, 1.0) for name in names])
         self.family = str(rng.choice(names, p=weights / weights.sum()))
         low, high = np.log(config.resolution)
-        self.resolution = int(round(float(np.exp(rng.uniform(low, high)))))
+        self.resolution = round(float(np.exp(rng.uniform(low, high))))
         self.size = float(np.exp(rng.uniform(*np.log(config.size))))
         self.cloud_seed = int(streams[1].generate_state(1, np.uint64)[0] >> np.uint64(1))
         self.points = np.random.default_rng(streams[2])

@@ -51,8 +51,8 @@ def sample_points(
     Returns points (n, 3), directions (n, 3) and kinds (n,), in random order. In a cloud so thin that a bounded number of lines does not
     collide often enough, the missing collisions are drawn in proportion to extinction, which is their distribution in the thin limit.
     """
-    second = int(round(deeper * n))
-    loose = int(round(anywhere * n))
+    second = round(deeper * n)
+    loose = round(anywhere * n)
     found = []
     for kind, wanted in ((FIRST_COLLISION, n - second - loose), (SECOND_COLLISION, second)):
         points, w = _collisions(rng, field, wanted, kind == SECOND_COLLISION)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.replacing import replacing
 from deepclouds.volume import Volume
 
 SCHEMA = 1
@@ -80,15 +81,11 @@ def shard_file(index: int) -> str:
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file under a temporary name beside it and rename it, so that it is there whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        # A machine that stops right after the renaming must not leave an empty file under the final name.
+        os.fsync(stream.fileno())
 
 
 def write_shard(path: Path, shard: Shard, header: Mapping[str, Any]) -> str:

@@ -77,7 +77,7 @@ def _spread(values: Sequence[float]) -> str:
 
 def _make(arguments: argparse.Namespace) -> None:
     # The writers load a native module, which listing and previews do without.
-    from deepclouds.volume._replacing import replacing
+    from deepclouds.replacing import replacing
     from deepclouds_training.clouds.scene import scale_for_optical_depth, write_mitsuba_scene
 
     given: dict[str, str] = {}
@@ -107,7 +107,7 @@ def _make(arguments: argparse.Namespace) -> None:
 def _preview(arguments: argparse.Namespace) -> None:
     from PIL import Image
 
-    from deepclouds.volume._replacing import replacing
+    from deepclouds.replacing import replacing
     from deepclouds_training.clouds._preview import contact_sheet
 
     if arguments.output.suffix.lower() != ".png":

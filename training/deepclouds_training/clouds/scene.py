@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from deepclouds.errors import InputError
+from deepclouds.replacing import replacing
 from deepclouds.volume import Volume
-from deepclouds.volume._replacing import replacing
 
 _SCENE = """<scene version="3.0.0">
   <default name="integrator" value="volpath"/>
