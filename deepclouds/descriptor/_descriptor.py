@@ -156,11 +156,11 @@ class Descriptor:
     ) -> NDArray[np.float32]:
         """Stencils (n, 10, 225) of NumPy arrays of points and directions, each (n, 3), and azimuths (n,)."""
         types = self.field.types
-        arrays = [types.Array3f(np.ascontiguousarray(np.asarray(a, np.float32).T)) for a in (points, w, omega_sun)]
+        x, d, sun = (types.Array3f(np.ascontiguousarray(np.asarray(a, np.float32).T)) for a in (points, w, omega_sun))
         turn = None if azimuth is None else types.Float(np.ascontiguousarray(azimuth, np.float32))
         n = len(np.asarray(points))
         result = np.empty((n, LEVELS, POINTS), np.float32)
-        for k, level in enumerate(self.levels(*arrays, turn)):
+        for k, level in enumerate(self.levels(x, d, sun, turn)):
             result[:, k] = level.numpy().reshape(n, POINTS)
         return result
 

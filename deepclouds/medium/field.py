@@ -10,6 +10,9 @@ import numpy as np
 
 from deepclouds.volume import Volume
 
+# Stands for an infinite distance where a difference of two must stay a number.
+_FAR = 3.0e38
+
 
 class Field:
     """The extinction ``sigma_t(x) = scale * density(x)`` of one volume, ready for Dr.Jit kernels.
@@ -94,13 +97,13 @@ class Field:
     def intersect(self, origin: Any, direction: Any) -> tuple[Any, Any]:
         """Distances at which rays enter (0 where the origin is inside) and leave the box; `leave <= enter` is a miss."""
         o, d = self.to_unit(origin), self.direction_to_unit(direction)
-        enter, leave = self.types.Float(0), self.types.Float(dr.largest(self.types.Float))
+        enter, leave = self.types.Float(0), self.types.Float(_FAR)
         for a, b in zip(o, d, strict=True):
             parallel = dr.abs(b) < 1e-12
             inverse = dr.rcp(dr.select(parallel, 1.0, b))
             t0, t1 = -a * inverse, (1 - a) * inverse
             outside = parallel & ((a < 0) | (a > 1))
             near = dr.select(parallel, 0.0, dr.minimum(t0, t1))
-            far = dr.select(parallel, dr.select(outside, -1.0, dr.largest(self.types.Float)), dr.maximum(t0, t1))
+            far = dr.select(parallel, dr.select(outside, -1.0, _FAR), dr.maximum(t0, t1))
             enter, leave = dr.maximum(enter, near), dr.minimum(leave, far)
         return enter, leave

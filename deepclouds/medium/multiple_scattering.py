@@ -164,7 +164,7 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
             enter, leave = field.intersect(origin, direction)
             position = field.to_unit(origin)
             # A ray that misses the box starts beyond it, and so escapes at its first step.
-            distance = dr.select(leave > enter, enter, dr.largest(Float) * 1e-6)
+            distance = dr.select(leave > enter, enter, 1e32)
             for k in range(k_suns):
                 suns[k] = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.suns[k]))
             for m in range(m_albedos):

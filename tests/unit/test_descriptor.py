@@ -189,7 +189,7 @@ def test_filtered_cells_hold_exact_averages_of_the_trilinear_field(cloud: Volume
     inside = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     for level in levels:
         for k, j, i in [(1, 1, 1), (0, 2, 1), (2, 1, 3)]:
-            lower = frame.origin + frame.axes @ ((level.first + (i, j, k)) * level.spacing)
+            lower = frame.origin + frame.axes @ ((level.first + np.array([i, j, k])) * level.spacing)
             brute = cloud.sample(lower + inside * level.spacing @ frame.axes.T).mean()
             assert level.values[k, j, i] == pytest.approx(brute, abs=3e-3)
     total = [float(level.values.sum(dtype=np.float64)) * level.spacing**3 for level in levels]

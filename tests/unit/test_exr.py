@@ -137,9 +137,13 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, image: np.ndarray) -
     write_exr(path, layers(image))
     before = path.read_bytes()
 
-    with pytest.raises(RuntimeError, match="disk full"), replacing(path, ".exr") as temporary:
-        temporary.write_bytes(b"half")
-        raise RuntimeError("disk full")
+    def fail() -> None:
+        with replacing(path, ".exr") as temporary:
+            temporary.write_bytes(b"half")
+            raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        fail()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 

@@ -23,7 +23,8 @@ _MOST_LINES = 2**21
 def uniform_directions(rng: Generator, *shape: int) -> NDArray[np.float32]:
     """Unit vectors uniform over the sphere, (*shape, 3)."""
     v = rng.normal(size=(*shape, 3))
-    return (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-30)).astype(np.float32)
+    unit: NDArray[np.float32] = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-30)).astype(np.float32)
+    return unit
 
 
 def around(rng: Generator, directions: NDArray[np.float32], angle: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -31,7 +32,8 @@ def around(rng: Generator, directions: NDArray[np.float32], angle: NDArray[np.fl
     side = np.cross(directions, uniform_directions(rng, len(directions)))
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-30)
     turned = np.cos(angle)[:, None] * directions + np.sin(angle)[:, None] * side
-    return (turned / np.linalg.norm(turned, axis=1, keepdims=True)).astype(np.float32)
+    unit: NDArray[np.float32] = (turned / np.linalg.norm(turned, axis=1, keepdims=True)).astype(np.float32)
+    return unit
 
 
 def random_lines(rng: Generator, field: Field, n: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -95,7 +97,8 @@ def _in_extinction(rng: Generator, field: Field, n: int) -> NDArray[np.float32]:
     z, y, x = np.unravel_index(index, density.shape)
     unit = (np.stack([x, y, z], axis=1) + rng.random((n, 3))) / np.array(field.volume.resolution)
     to_world = field.volume.to_world
-    return (unit @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32)
+    points: NDArray[np.float32] = (unit @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32)
+    return points
 
 
 def sample_suns(rng: Generator, w: NDArray[np.float32], suns: int) -> NDArray[np.float32]:
