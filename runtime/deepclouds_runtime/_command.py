@@ -62,12 +62,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument("--spp", type=_positive, help="samples a pixel (default: the scene's; 32 for a volume)")
     parser.add_argument("--seed", type=_seed, default=0, help="of all random numbers (default %(default)s)")
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with deepclouds)")
-    parser.add_argument("--max-depth", type=int, help="-1 for all orders of scattering, 2 for single scattering alone (default: the scene's)")
+    parser.add_argument(
+        "--max-depth", type=int, help="-1 for all orders of scattering, 2 for single scattering alone (default: the scene's)"
+    )
     parser.add_argument("--hide-emitters", action="store_true", default=None, help="black behind the cloud in place of the sky")
     parser.add_argument("--env-directions", type=_positive, help="directions drawn from an environment at each sample (default 2)")
-    parser.add_argument(
-        "--no-interreflection", action="store_true", help="leave out the light that surfaces and cloud throw on each other"
-    )
+    parser.add_argument("--no-interreflection", action="store_true", help="leave out the light that surfaces and cloud throw on each other")
     parser.add_argument("--png", metavar="FILE", nargs="?", const="", help="also write a tone-mapped preview (default name: OUT.png)")
     parser.add_argument("--exposure", type=float, default=0.0, help="of the preview, in stops (default %(default)s)")
     parser.add_argument("--threads", type=_positive, help="threads to use (default: all cores)")
@@ -81,10 +81,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     volume.add_argument("--extinction", type=float, help="extinction at density 1, per world unit, in place of --optical-depth")
     volume.add_argument("--albedo", type=_numbers((1, 3)), metavar="A|R,G,B", help="single-scattering albedo (default 1)")
     volume.add_argument("--g", type=float, help="Henyey-Greenstein parameter, -1 to 1 (default 0.85)")
-    volume.add_argument("--sun", type=_numbers((2,)), metavar=_PAIR, help="where the sun stands, degrees; azimuth 0 is +Z and grows to +X (default 50,40)")
-    volume.add_argument("--irradiance", type=_numbers((1, 3)), metavar="E|R,G,B", help="of the sun, perpendicular to it (default 6)")
+    volume.add_argument(
+        "--sun", type=_numbers((2,)), metavar=_PAIR, help="where the sun stands, degrees; azimuth 0 is +Z and grows to +X (default 65,35)"
+    )
+    volume.add_argument("--irradiance", type=_numbers((1, 3)), metavar="E|R,G,B", help="of the sun, perpendicular to it (default 12)")
     volume.add_argument("--env", metavar="FILE", help="environment map for light and background, in place of sun and sky")
-    volume.add_argument("--sky", type=_numbers((1, 3)), metavar="L|R,G,B", help="radiance of the uniform sky (default 0.14,0.26,0.5)")
+    volume.add_argument("--sky", type=_numbers((1, 3)), metavar="L|R,G,B", help="radiance of the uniform sky (default 0.09,0.17,0.34)")
     volume.add_argument("--up", choices=("y", "z"), help="axis that points up; with z, azimuth 0 is +X and grows to +Y (default y)")
     volume.add_argument("--view", type=_numbers((2,)), metavar=_PAIR, help="where the camera stands, degrees, like --sun (default 0,5)")
     volume.add_argument("--size", type=_size, metavar="WxH", help="pixels (default 640x480)")

@@ -54,7 +54,7 @@ def _predictor(model: str | None) -> Any:
 
 def _integrator_class(mi: Any) -> Any:
     # Each variant has base classes of its own, so the class is made anew for each.
-    class DeepCloudsIntegrator(mi.SamplingIntegrator):  # type: ignore[misc, name-defined]
+    class DeepCloudsIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
         """See the module."""
 
         def __init__(self, properties: Any) -> None:
@@ -68,9 +68,7 @@ def _integrator_class(mi: Any) -> Any:
             self.interreflection = bool(properties.get("interreflection", True))
             self.multiple = str(properties.get("multiple", "network"))
 
-        def render(
-            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
-        ) -> Any:
+        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
             """Render through the film: a tensor (h, w, channels of the film's pixel format), empty unless `develop`."""
             from deepclouds_runtime.renderer import Renderer
             from deepclouds_runtime.scene import read_scene

@@ -146,7 +146,8 @@ class Environment:
     def _find(self, sums: Any, offset: Any, count: int, u: Any) -> tuple[Any, Any, Any]:
         """Index of the interval of a cumulative sum that holds `u`, and the interval's ends."""
         t = self.types
-        index = dr.binary_search(0, count, lambda i: dr.gather(t.Float, sums, offset + i + 1) <= u)
+        search: Any = dr.binary_search  # it has no type hints
+        index = search(0, count, lambda i: dr.gather(t.Float, sums, offset + i + 1) <= u)
         index = dr.minimum(index, count - 1)
         return index, dr.gather(t.Float, sums, offset + index), dr.gather(t.Float, sums, offset + index + 1)
 

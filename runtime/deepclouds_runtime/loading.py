@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ def load(
     if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
         from deepclouds_runtime.predictor import Predictor
 
-        predictor = Predictor(model, threads)
+        predictor = Predictor(None if model is None else fspath(model), threads)
     return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)
 
 
@@ -114,5 +114,7 @@ def load_xml(path: Path, defines: dict[str, str]) -> Any:
     except (RuntimeError, TypeError) as error:
         message = " ".join(str(error).split())
         if "unused parameters" in message:
-            raise InputError(f"{path}: the scene has no such parameter: {message.rpartition('parameters:')[2].strip(' -')}; leave it out") from error
+            raise InputError(
+                f"{path}: the scene has no such parameter: {message.rpartition('parameters:')[2].strip(' -')}; leave it out"
+            ) from error
         raise InputError(f"{path}: Mitsuba cannot load the scene: {message}") from error

@@ -40,7 +40,8 @@ def cube_transform(positions: NDArray[np.floating[Any]], canonical: NDArray[np.f
         return None
     matrix = np.eye(4)
     matrix[:3] = solution.T
-    return matrix @ _UNIT_TO_CUBE
+    transform: Matrix = matrix @ _UNIT_TO_CUBE
+    return transform
 
 
 def box_transform(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Matrix:

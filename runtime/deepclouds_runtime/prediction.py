@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from os import PathLike, fspath
 from typing import TYPE_CHECKING, Any
@@ -76,14 +77,13 @@ def predict(
     if len(x) == 0 or albedo == 0:
         return np.zeros(len(x))
     types = types_named(backend)
-    import drjit as dr
 
     def upload(values: NDArray[np.float32]) -> Any:
         return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c])) for c in range(3)))
 
     field = Field(types, volume, scale)
     p, d, s = upload(x), upload(w), upload(suns)
-    tau = optical_depth(field, p, s, types.Float(0), dr.largest(types.Float), types.Float(0.5), types.Bool(True), float("inf"))
+    tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
     network = predictor if predictor is not None else _predictor(None if model is None else fspath(model))
     j = NetworkScattering(field, network)(p, d, s, g, (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)

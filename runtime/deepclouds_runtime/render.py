@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def render(
-    input: Any,  # noqa: A002
+    input: Any,
     spp: int | None = None,
     seed: int = 0,
     defines: Mapping[str, str] | None = None,

@@ -196,7 +196,8 @@ class _Work:
         pixel = local + dr.opaque(types.UInt32, first)
         numbers = Stratified(types, pixel, index - local * count, count, dr.opaque(types.UInt32, self.seed & 0xFFFFFFFF))
         origin, direction, end, camera = self._rays(pixel, numbers)
-        interaction, shown = None, None
+        interaction: Any = None
+        shown: Any = None
         if scene.surfaces is not None:
             interaction, end, shown = self._surfaces(origin, direction, end)
         clock = time.perf_counter()

@@ -146,7 +146,9 @@ def _camera(scene: Any, sensor: Any, notes: list[str]) -> Any:
         raise InputError(f"sensor {sensor.class_name()}: deepclouds renders the `perspective` sensor only")
     film = sensor.film()
     if tuple(film.crop_size()) != tuple(film.size()):
-        raise InputError(f"film: a crop window of {tuple(film.crop_size())} in {tuple(film.size())}: render the whole image and crop it afterwards")
+        raise InputError(
+            f"film: a crop window of {tuple(film.crop_size())} in {tuple(film.size())}: render the whole image and crop it afterwards"
+        )
     if film.class_name() != "HDRFilm":
         raise InputError(f"film {film.class_name()}: deepclouds renders into `hdrfilm` only")
     if film.rfilter().class_name() != "BoxFilter":
@@ -167,14 +169,18 @@ def _split_shapes(scene: Any) -> tuple[list[Any], list[Any]]:
         null = bsdf is None or bsdf.class_name() == "Null"
         if shape.interior_medium() is not None:
             if not null:
-                raise InputError(f"{name} has a medium inside and the BSDF {bsdf.class_name()}; the cloud's container needs the BSDF `null`")
+                raise InputError(
+                    f"{name} has a medium inside and the BSDF {bsdf.class_name()}; the cloud's container needs the BSDF `null`"
+                )
             containers.append(shape)
         elif null:
             continue
         else:
             flags = bsdf.flags()
             if mi.has_flag(flags, mi.BSDFFlags.Null) or mi.has_flag(flags, mi.BSDFFlags.Transmission):
-                raise InputError(f"{name} has the BSDF {bsdf.class_name()}, which lets light through; surfaces around the cloud must be opaque")
+                raise InputError(
+                    f"{name} has the BSDF {bsdf.class_name()}, which lets light through; surfaces around the cloud must be opaque"
+                )
             surfaces.append(shape)
     return containers, surfaces
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 from typing import Any
 
@@ -47,7 +48,7 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
     def through(omega: Any) -> tuple[Any, Any]:
         """Share of the light from direction `omega` that the cloud lets pass, and where the ray starts."""
         origin = plain(types, interaction.spawn_ray(mi.Vector3f(omega)).o)
-        tau = optical_depth(cloud.field, origin, omega, types.Float(0), dr.largest(types.Float), jitter, plain(types, valid))
+        tau = optical_depth(cloud.field, origin, omega, types.Float(0), types.Float(math.inf), jitter, plain(types, valid))
         return dr.exp(-tau), origin
 
     def facing(omega: Any) -> list[Any]:
@@ -83,9 +84,7 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
     return [dr.select(plain(types, valid), value, 0) for value in total]
 
 
-def reflected_from_cloud(
-    cloud: Cloud, lights: Lights, interaction: Any, weight: Any, numbers: Stratified, counts: Counts
-) -> list[Any]:
+def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight: Any, numbers: Stratified, counts: Counts) -> list[Any]:
     """Radiance that surfaces send back of the light the cloud throws on them: one ray into the cloud a lane.
 
     Parameters
@@ -140,9 +139,7 @@ def reflected_from_cloud(
         most = dr.maximum(most, value)
     ray = interaction.spawn_ray(mi.Vector3f(omega))
     end = plain(types, lights.shade.surfaces.ray_intersect(ray).t)
-    light = cloud_light(
-        cloud, lights, plain(types, ray.o), omega, end, numbers, counts, dr.select(plain(types, valid), most * weight, 0)
-    )
+    light = cloud_light(cloud, lights, plain(types, ray.o), omega, end, numbers, counts, dr.select(plain(types, valid), most * weight, 0))
     return [t * (s + j) for t, s, j in zip(throughput, light.direct, light.indirect, strict=True)]
 
 

@@ -9,6 +9,7 @@ directions drawn from environments.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -136,7 +137,7 @@ def cloud_light(
     result.direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
     result.indirect = [dr.zeros(types.Float, n) for _ in range(channel_count)]
     dr.eval(result.opacity, result.transmittance, result.distance, origin, direction)
-    lanes = dr.compress(result.opacity > 0)
+    lanes: Any = dr.compress(result.opacity > 0)
     counts.cloud_samples += len(lanes)
     if len(lanes) == 0 or not any(a > 0 for a in cloud.albedo):
         return result
@@ -147,7 +148,7 @@ def cloud_light(
     return result
 
 
-def _taker(types: ModuleType, lanes: Any) -> Any:
+def _taker(types: Any, lanes: Any) -> Any:
     def take(value: Any) -> Any:
         if dr.depth_v(value) > 1:
             return types.Array3f(*(take(c) for c in value))
@@ -178,14 +179,14 @@ def _scatter(
     # Which samples are worth a query is the same for all lights: one that lies in a thin place is so for each of them.
     keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
     asked = numbers.number(stratified.ROULETTE) < keep
-    queries = dr.compress(asked) if cloud.scattering is not None else types.UInt32()
+    queries: Any = dr.compress(asked) if cloud.scattering is not None else types.UInt32()
     weight = dr.gather(types.Float, opacity / keep, queries)
     take = _taker(types, queries)
     target = dr.gather(types.UInt32, lanes, queries)
 
     def light(omega: Any, radiance: list[Any], share: Any) -> None:
         """One direction: `radiance` is what arrives over the density of the direction (the irradiance, of a sun)."""
-        tau = optical_depth(medium, points, omega, types.Float(0), dr.largest(types.Float), jitter, types.Bool(True), _DEEP)
+        tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True), _DEEP)
         single = hg(dr.dot(w, omega), g) * dr.exp(-tau) * share
         for c in range(channel_count):
             direct[c] += albedo[c] * radiance[c] * single
@@ -214,7 +215,7 @@ def _scatter(
             cosine = sample_hg_cosine(numbers_of(stratified.PHASE_U), g)
             omega = rotate_to(w, cosine, 2 * dr.pi * numbers_of(stratified.PHASE_V))
             drawn = hg(cosine, g)
-            tau = optical_depth(medium, points, omega, types.Float(0), dr.largest(types.Float), jitter, types.Bool(True))
+            tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True))
             share = drawn / (drawn + source.density(omega)) * (1.0 / directions) * dr.exp(-tau)
             for c, value in enumerate(source.arriving(points, omega, numbers)):
                 direct[c] += albedo[c] * value * share

@@ -18,7 +18,7 @@ from deepclouds_runtime.scene import CloudScene, check_depth, read_lights
 _FOV = 30.0
 _MARGIN = 1.08
 _DEFAULT_OPTICAL_DEPTH = 60.0
-_DEFAULT_SUN = (50.0, 40.0)
+_DEFAULT_SUN = (65.0, 35.0)
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class VolumeOptions:
         Henyey-Greenstein parameter.
     sun
         azimuth and elevation of the sun. With ``up = "y"`` azimuth 0 is +Z and grows toward +X; with ``up = "z"`` it is +X and grows
-        toward +Y. By default (50, 40), or no sun when `env` is given.
+        toward +Y. By default (65, 35), or no sun when `env` is given.
     irradiance
         of the sun, perpendicular to it: one value or three.
     env
@@ -63,9 +63,9 @@ class VolumeOptions:
     albedo: tuple[float, ...] = (1.0,)
     g: float = 0.85
     sun: tuple[float, float] | None = None
-    irradiance: tuple[float, ...] = (6.0,)
+    irradiance: tuple[float, ...] = (12.0,)
     env: str | None = None
-    sky: tuple[float, ...] = (0.14, 0.26, 0.5)
+    sky: tuple[float, ...] = (0.09, 0.17, 0.34)
     up: str = "y"
     view: tuple[float, float] = (0.0, 5.0)
     size: tuple[int, int] = (640, 480)
@@ -96,25 +96,9 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
     """
     _check(options)
     mi = mitsuba()
-    scale = _extinction(volume, options, source)
-    description: dict[str, Any] = {"type": "scene", "camera": _camera(volume, options)}
-    sun = options.sun if options.sun is not None or options.env is not None else _DEFAULT_SUN
-    if sun is not None and max(options.irradiance) > 0:
-        description["sun"] = {
-            "type": "directional",
-            "direction": (-_direction(sun, options.up)).tolist(),
-            "irradiance": {"type": "rgb", "value": list(_three(options.irradiance))},
-        }
-    if options.env is not None:
-        if not Path(options.env).is_file():
-            raise InputError(f"{options.env}: no such environment map")
-        # Mitsuba's maps have +Y up; a quarter turn about X stands them upright where +Z is up.
-        stand = mi.ScalarTransform4f().rotate([0, 0, 1], 90).rotate([1, 0, 0], 90) if options.up == "z" else mi.ScalarTransform4f()
-        description["sky"] = {"type": "envmap", "filename": options.env, "to_world": stand}
-    elif max(options.sky) > 0:
-        description["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": list(_three(options.sky))}}
+    scale = extinction(volume, options, source)
     try:
-        scene = mi.load_dict(description)
+        scene = mi.load_dict(description(volume, options))
     except RuntimeError as error:
         raise InputError(f"{source}: Mitsuba cannot build the scene around it ({error})") from error
     suns, environment = read_lights(scene)
@@ -132,6 +116,56 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
         options.hide_emitters,
         check_depth(options.max_depth),
     )
+
+
+def description(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
+    """Camera and lights as a dictionary for ``mitsuba.load_dict``, in any variant; raises InputError for a missing environment map."""
+    import mitsuba as mi
+
+    scene: dict[str, Any] = {"type": "scene", "camera": _camera(volume, options)}
+    sun = options.sun if options.sun is not None or options.env is not None else _DEFAULT_SUN
+    if sun is not None and max(options.irradiance) > 0:
+        scene["sun"] = {
+            "type": "directional",
+            "direction": (-_direction(sun, options.up)).tolist(),
+            "irradiance": {"type": "rgb", "value": list(_three(options.irradiance))},
+        }
+    if options.env is not None:
+        if not Path(options.env).is_file():
+            raise InputError(f"{options.env}: no such environment map")
+        # Mitsuba's maps have +Y up; a change of axes, x to y to z to x, stands them upright where +Z is up.
+        axes = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64) if options.up == "z" else np.eye(4)
+        stand = mi.ScalarTransform4f(axes.tolist())
+        scene["sky"] = {"type": "envmap", "filename": options.env, "to_world": stand}
+    elif max(options.sky) > 0:
+        scene["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": list(_three(options.sky))}}
+    return scene
+
+
+def cloud_description(volume: Volume, options: VolumeOptions, source: str) -> dict[str, Any]:
+    """The whole scene, cloud included, for Mitsuba's own integrators: what `volume_scene` renders, as a dictionary."""
+    import mitsuba as mi
+
+    unit = mi.ScalarTransform4f(volume.to_world.tolist())
+    to_cube = mi.ScalarTransform4f().translate(0.5) @ mi.ScalarTransform4f().scale(0.5)
+    medium = {
+        "type": "heterogeneous",
+        "albedo": {"type": "rgb", "value": list(_three(options.albedo))},
+        "scale": extinction(volume, options, source),
+        "sigma_t": {"type": "gridvolume", "grid": mi.VolumeGrid(np.ascontiguousarray(volume.density[..., None])), "to_world": unit},
+        "phase": {"type": "hg", "g": options.g},
+    }
+    container = {"type": "cube", "to_world": unit @ to_cube, "bsdf": {"type": "null"}, "interior": medium}
+    return {
+        **description(volume, options),
+        "cloud": container,
+        "integrator": {
+            "type": "volpath",
+            "max_depth": options.max_depth,
+            "rr_depth": 1_000_000,
+            "hide_emitters": options.hide_emitters,
+        },
+    }
 
 
 def _three(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -166,7 +200,8 @@ def _check(options: VolumeOptions) -> None:
             refuse(name, "azimuth and elevation in degrees")
 
 
-def _extinction(volume: Volume, options: VolumeOptions, source: str) -> float:
+def extinction(volume: Volume, options: VolumeOptions, source: str) -> float:
+    """Extinction at density 1, 1 / world length, that the options ask for."""
     if options.extinction is not None:
         return options.extinction
     depth = _DEFAULT_OPTICAL_DEPTH if options.optical_depth is None else options.optical_depth
@@ -195,7 +230,8 @@ def _direction(angles: tuple[float, float], up: str) -> NDArray[np.float64]:
 
 def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
     """Perspective camera as near as the box around the filled voxels allows."""
-    mi = mitsuba()
+    import mitsuba as mi
+
     toward = _direction(options.view, options.up)
     forward = -toward
     up = _axes(options.up)[2]
@@ -226,9 +262,7 @@ def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
         "fov_axis": "larger",
         "near_clip": 1e-4 * distance,
         "far_clip": 1e3 * distance,
-        "to_world": mi.ScalarTransform4f().look_at(
-            origin=(middle + toward * distance).tolist(), target=middle.tolist(), up=up.tolist()
-        ),
+        "to_world": mi.ScalarTransform4f().look_at(origin=(middle + toward * distance).tolist(), target=middle.tolist(), up=up.tolist()),
         "film": film,
         "sampler": {"type": "independent", "sample_count": int(options.spp)},
     }

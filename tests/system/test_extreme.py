@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
-from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.renderer import COLOURS, LAYERS, Renderer, RenderResult
 from deepclouds_runtime.scene import CloudScene, read_lights, surfaces_alone
+from numpy.typing import NDArray
+
+from deepclouds.volume import Volume
 
 
 class Formula:
@@ -106,7 +106,11 @@ def _render(mi: Any, case: Case) -> RenderResult:
         description["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(image)}
     world = [v * case.world for v in case.origin]
     target = [v * case.world for v in case.target]
-    up = [0, 1, 0] if abs(np.array(case.target)[1] - case.origin[1]) < 0.9 * np.linalg.norm(np.array(case.target) - case.origin) else [1, 0, 0]
+    up = (
+        [0, 1, 0]
+        if abs(np.array(case.target)[1] - case.origin[1]) < 0.9 * np.linalg.norm(np.array(case.target) - case.origin)
+        else [1, 0, 0]
+    )
     description["camera"] = {
         "type": "perspective",
         "fov": 40,
@@ -166,14 +170,17 @@ CASES: dict[str, Case] = {
     "white": replace(BASE, albedo=(1, 1, 1)),
     "one black channel": replace(BASE, albedo=(1, 0, 0.5)),
 }
-CASES |= {f"grid {kind}": replace(BASE, density=f"ones{kind}") for kind in ("1x1x5", "1x5x1", "5x1x1", "1x4x4", "4x1x4", "4x4x1", "2x3x50", "50x2x1")}
+CASES |= {
+    f"grid {kind}": replace(BASE, density=f"ones{kind}")
+    for kind in ("1x1x5", "1x5x1", "5x1x1", "1x4x4", "4x1x4", "4x4x1", "2x3x50", "50x2x1")
+}
 CASES |= {f"optical depth {depth:g}": replace(BASE, optical_depth=depth) for depth in (0, 1e-20, 1e-6, 1e-3, 1, 100, 1e3, 1e5, 1e8)}
 CASES |= {f"g {g}": replace(BASE, g=g) for g in (-0.99, -0.5, 0.0, 1e-4, 0.5, 0.99, 0.999)}
 CASES |= {f"g {g} under a sky": replace(BASE, g=g, sky="map") for g in (-0.99, 0.0, 0.99)}
 CASES |= {f"albedo {a}": replace(BASE, albedo=(a, a, a)) for a in (1e-6, 0.5, 0.999999)}
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 CASES |= {f"sun along {name}": replace(BASE, sun=axis) for name, axis in AXES.items()}
-CASES |= {f"view from {name}": replace(BASE, origin=tuple(4 * v for v in axis)) for name, axis in AXES.items()}
+CASES |= {f"view from {name}": replace(BASE, origin=(4 * axis[0], 4 * axis[1], 4 * axis[2])) for name, axis in AXES.items()}
 for g in (0.0, 0.99):
     CASES[f"into the sun, g {g}"] = replace(BASE, sun=(0, 0, -1), origin=(0, 0, 4), g=g, size=(9, 9))
     CASES[f"away from the sun, g {g}"] = replace(BASE, sun=(0, 0, 1), origin=(0, 0, 4), g=g, size=(9, 9))

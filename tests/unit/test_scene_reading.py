@@ -1,0 +1,236 @@
+"""What is read out of a Mitsuba scene, and what is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from deepclouds_runtime.placement import box_transform, cube_transform, locate, orientations
+from deepclouds_runtime.scene import check_depth, read_scene
+
+from deepclouds.errors import InputError
+
+FILM = '<film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/>{film}</film>'
+CAMERA = f'<sensor type="perspective">{FILM}</sensor>'
+BOX = '<rfilter type="box"/>'
+SUN = '<emitter type="directional"><vector name="direction" value="0, -2, 0"/><rgb name="irradiance" value="3 2 1"/></emitter>'
+HG = '<phase type="hg"><float name="g" value="0.3"/></phase>'
+ALBEDO = '<rgb name="albedo" value="0.9 0.8 0.7"/>'
+GRID = (
+    '<volume type="gridvolume" name="sigma_t"><string name="filename" value="density.vol"/>{extra}'
+    '<transform name="to_world">{turn}</transform></volume>'
+)
+PLACE = '<translate x="-0.5" y="-0.5" z="-0.5"/><scale value="2"/>'
+MEDIUM = '<medium type="heterogeneous" name="interior"><float name="scale" value="5"/>{grid}{albedo}{phase}</medium>'
+CLOUD = '<shape type="{shape}"><transform name="to_world">{turn}</transform>{bsdf}{medium}</shape>'
+NULL = '<bsdf type="null"/>'
+
+
+@pytest.fixture(autouse=True)
+def mi() -> Iterator[Any]:
+    import mitsuba
+
+    before = mitsuba.variant()
+    mitsuba.set_variant("llvm_ad_rgb")
+    yield mitsuba
+    if before is not None:
+        mitsuba.set_variant(before)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, mi: Any) -> Path:
+    density = np.random.default_rng(3).random((5, 6, 7)).astype(np.float32)
+    mi.VolumeGrid(density[..., None]).write(str(tmp_path / "density.vol"))
+    mi.VolumeGrid(np.random.default_rng(4).random((5, 6, 7, 3)).astype(np.float32)).write(str(tmp_path / "colours.vol"))
+    return tmp_path
+
+
+def cloud(
+    turn: str = "",
+    grid_turn: str | None = None,
+    extra: str = "",
+    shape: str = "cube",
+    bsdf: str = NULL,
+    albedo: str = ALBEDO,
+    phase: str = HG,
+) -> str:
+    """A container with a heterogeneous medium, the grid in its box unless `grid_turn` places it elsewhere."""
+    grid = GRID.format(turn=PLACE + (turn if grid_turn is None else grid_turn), extra=extra)
+    return CLOUD.format(shape=shape, turn=turn, bsdf=bsdf, medium=MEDIUM.format(grid=grid, albedo=albedo, phase=phase))
+
+
+def load(mi: Any, folder: Path, content: str, camera: str = CAMERA.format(film=BOX)) -> Any:
+    """Load a scene from text."""
+    file = folder / "scene.xml"
+    file.write_text(f'<scene version="3.0.0">{camera}{content}</scene>')
+    return mi.load_file(str(file))
+
+
+TURNS = {
+    "plain": "",
+    "scaled": '<scale x="0.7" y="2" z="1.1"/><translate x="3" y="-2" z="1"/>',
+    "upright": '<rotate x="1" angle="-90"/>',
+    "quarter turn": '<rotate y="1" angle="90"/><scale x="1.5" y="1" z="1"/>',
+    "mirrored": '<scale x="-1" y="1" z="1"/>',
+    "rotated": '<rotate x="0.6" y="0" z="-0.8" angle="37"/><scale value="1.3"/><translate x="0.5" y="0" z="0"/>',
+    "large": '<scale value="4000"/>',
+    "small": '<scale value="0.0004"/>',
+}
+
+
+@pytest.mark.parametrize("name", TURNS)
+def test_the_grid_lies_where_mitsuba_has_it(mi: Any, folder: Path, name: str) -> None:
+    scene = load(mi, folder, cloud(TURNS[name]) + SUN)
+    read = read_scene(scene)
+    unit = np.random.default_rng(9).random((100, 3))
+    points = unit @ read.volume.to_world[:3, :3].T + read.volume.to_world[:3, 3]
+    interaction = mi.MediumInteraction3f()
+    theirs = []
+    medium = scene.shapes()[0].interior_medium()
+    for p in points:
+        interaction.p = mi.Point3f(*p.tolist())
+        theirs.append(float(medium.get_scattering_coefficients(interaction)[2][0][0]))
+    error = np.abs(read.scale * read.volume.sample(points) - theirs)
+    assert np.quantile(error, 0.95) < 0.01
+    assert read.scale == 5
+    np.testing.assert_allclose(read.albedo, (0.9, 0.8, 0.7), rtol=1e-6)
+    assert read.g == pytest.approx(0.3)
+
+
+def test_lights_camera_and_integrator(mi: Any, folder: Path) -> None:
+    integrator = '<integrator type="volpath"><integer name="max_depth" value="2"/><boolean name="hide_emitters" value="true"/></integrator>'
+    constant = '<emitter type="constant"/>'
+    floor = '<shape type="rectangle"><bsdf type="diffuse"/></shape>'
+    read = read_scene(load(mi, folder, integrator + cloud() + SUN + SUN + constant + floor))
+    assert read.max_depth == 2
+    assert read.hide_emitters
+    assert len(read.suns) == 2
+    np.testing.assert_allclose(read.suns[0].omega_sun, (0, 1, 0), atol=1e-6)
+    np.testing.assert_allclose(read.suns[0].irradiance, (3, 2, 1))
+    assert read.environment is not None
+    assert len(read.surfaces.shapes()) == 1
+    assert read.size == (6, 4)
+    assert read_scene(load(mi, folder, cloud())).surfaces is None
+    assert not read_scene(load(mi, folder, integrator + cloud()), hide_emitters=False).hide_emitters
+
+
+def test_homogeneous_media(mi: Any, folder: Path) -> None:
+    medium = (
+        f'<medium type="homogeneous" name="interior"><float name="sigma_t" value="2"/><float name="scale" value="3"/>{ALBEDO}{HG}</medium>'
+    )
+    turn = TURNS["rotated"]
+    read = read_scene(load(mi, folder, CLOUD.format(shape="cube", turn=turn, bsdf=NULL, medium=medium)))
+    assert read.volume.density.shape == (1, 1, 1)
+    assert read.scale == pytest.approx(6)
+    center = read.volume.to_world @ (0.5, 0.5, 0.5, 1)
+    np.testing.assert_allclose(center[:3], (0.5, 0, 0), atol=1e-6)
+    ball = read_scene(load(mi, folder, CLOUD.format(shape="sphere", turn='<translate x="2" y="0" z="0"/>', bsdf=NULL, medium=medium)))
+    volume = ball.volume.density.sum() * np.prod(ball.volume.voxel_size)
+    assert volume == pytest.approx(4 / 3 * np.pi, rel=2e-3)
+    assert ball.volume.sample(np.array([[2, 0, 0], [2.95, 0, 0], [2.9, 0.6, 0]])).tolist() == [1, 1, 0]
+
+
+def test_other_pixel_filters_are_noted(mi: Any, folder: Path) -> None:
+    read = read_scene(load(mi, folder, cloud(), CAMERA.format(film='<rfilter type="gaussian"/>')))
+    assert any("GaussianFilter" in note for note in read.notes)
+    assert not read_scene(load(mi, folder, cloud())).notes
+
+
+REFUSED = {
+    "no cloud": (SUN, "no shape has an interior medium"),
+    "two clouds": (cloud() + cloud('<translate x="5" y="0" z="0"/>'), "2 shapes have an interior medium"),
+    "glass around the medium": (cloud(bsdf='<bsdf type="dielectric"/>'), "needs the BSDF `null`"),
+    "glass beside the cloud": (cloud() + '<shape type="sphere"><bsdf type="dielectric"/></shape>', "lets light through"),
+    "mask": (cloud() + '<shape type="sphere"><bsdf type="mask"><bsdf type="diffuse"/></bsdf></shape>', "lets light through"),
+    "area light": (cloud() + '<shape type="sphere"><emitter type="area"/></shape>', "area light"),
+    "point light": (cloud() + '<emitter type="point"/>', "PointLight"),
+    "spot": (cloud() + '<emitter type="spot"/>', "SpotLight"),
+    "rayleigh": (cloud(phase='<phase type="rayleigh"/>'), "phase function Rayleigh"),
+    "tabphase": (cloud(phase='<phase type="tabphase"><string name="values" value="0.5, 1, 1.5"/></phase>'), "phase function Tab"),
+    "grid of colours": (cloud().replace("density.vol", "colours.vol"), "chromatic extinction"),
+    "varying albedo": (
+        cloud(albedo=GRID.replace("sigma_t", "albedo").format(turn=PLACE, extra="")),
+        "albedo varies",
+    ),
+    "nearest": (cloud(extra='<string name="filter_type" value="nearest"/>'), "filter_type"),
+    "container too small": (cloud('<scale value="0.6"/>', grid_turn=""), "cuts the cloud"),
+    "sphere too small": (cloud(shape="sphere", grid_turn=""), "cuts the cloud"),
+    "cylinder": (cloud(shape="cylinder", grid_turn=""), "Cylinder"),
+    "chromatic homogeneous": (
+        CLOUD.format(
+            shape="cube",
+            turn="",
+            bsdf=NULL,
+            medium=f'<medium type="homogeneous" name="interior"><rgb name="sigma_t" value="0.1 0.2 0.3"/>{HG}</medium>',
+        ),
+        "differs between colours",
+    ),
+    "depth": ('<integrator type="volpath"><integer name="max_depth" value="6"/></integrator>' + cloud(), "max_depth = 6"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refusals_name_what_they_refuse(mi: Any, folder: Path, name: str) -> None:
+    content, said = REFUSED[name]
+    scene = load(mi, folder, content)
+    with pytest.raises(InputError) as caught:
+        read_scene(scene)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        (CAMERA.format(film=BOX).replace("perspective", "orthographic"), "Orthographic"),
+        (CAMERA.format(film=BOX).replace('"perspective">', '"thinlens"><float name="aperture_radius" value="0.1"/>'), "ThinLens"),
+        (CAMERA.format(film=BOX + '<integer name="crop_width" value="2"/><integer name="crop_height" value="2"/>'), "crop"),
+    ],
+)
+def test_cameras_that_are_refused(mi: Any, folder: Path, camera: str, said: str) -> None:
+    scene = load(mi, folder, cloud(), camera)
+    with pytest.raises(InputError, match=said):
+        read_scene(scene)
+
+
+def test_path_lengths() -> None:
+    assert check_depth(-1) == -1
+    assert check_depth(0xFFFFFFFF) == -1
+    assert check_depth(2) == 2
+    for depth in (0, 1, 3, 64):
+        with pytest.raises(InputError, match=f"max_depth = {depth}"):
+            check_depth(depth)
+
+
+def test_all_orientations_are_different() -> None:
+    matrices = {m.round(6).tobytes() for m in orientations(box_transform(np.zeros(3), np.array([1.0, 2.0, 3.0])))}
+    assert len(matrices) == 48
+
+
+def test_a_wrong_box_is_not_accepted() -> None:
+    density = np.random.default_rng(1).random((4, 5, 6)).astype(np.float32)
+    right = box_transform(np.zeros(3), np.array([2.0, 2.0, 2.0]))
+    wrong = box_transform(np.zeros(3), np.array([2.0, 2.0, 2.3]))
+
+    def sigma_t(points: Any) -> Any:
+        from deepclouds.volume import Volume
+
+        return 3.0 * Volume(density, right).sample(points)
+
+    found = locate(density, 3.0, [wrong, right], sigma_t)
+    np.testing.assert_allclose(found.to_world, right)
+    with pytest.raises(InputError, match="cannot place the grid"):
+        locate(density, 3.0, [wrong], sigma_t)
+
+
+def test_a_sheared_cube_is_recovered_and_a_bent_one_is_not() -> None:
+    canonical = np.array(list(np.ndindex(2, 2, 2)), np.float64) * 2 - 1
+    matrix = np.array([[1, 0.3, 0, 1], [0, 2, 0.1, 2], [0.2, 0, 1, 3]])
+    positions = canonical @ matrix[:, :3].T + matrix[:, 3]
+    found = cube_transform(positions, canonical)
+    assert found is not None
+    np.testing.assert_allclose(found @ (1, 1, 1, 1), [*(matrix @ (1, 1, 1, 1)), 1], atol=1e-12)
+    positions[3] += 0.5
+    assert cube_transform(positions, canonical) is None
