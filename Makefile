@@ -4,7 +4,7 @@
 PYTHON ?= python3
 SCENES ?=
 TESTS ?=
-CONFIG ?= configs/first.toml
+MODEL ?= first
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -28,7 +28,7 @@ help:
 	echo "make test            all tests (TESTS='tests/unit -k vdb' for some)"
 	echo "make check           style and types"
 	echo "make bench           run time against error (SCENES=folder for other scenes)"
-	echo "make train-model     train a model (CONFIG=$(CONFIG))"
+	echo "make train-model     make labels, train and export a model (MODEL=$(MODEL)); run again after an interruption, it goes on"
 	echo "make setup           the installation alone; setup-test, setup-bench, setup-train add their packages"
 	echo "make clean           remove .venv and build"
 
@@ -50,7 +50,10 @@ bench: setup-bench
 	$(BIN)/python -m benchmarks.bench $(if $(SCENES),--scenes $(SCENES))
 
 train-model: setup-train
-	$(BIN)/python -m deepclouds_training.recipe $(CONFIG)
+	$(BIN)/deepclouds generate configs/$(MODEL)_labels.toml -o work/$(MODEL)
+	if [ -e work/$(MODEL)_run/checkpoint.pt ]; then run=--resume; else run=configs/$(MODEL).toml; fi; \
+	$(BIN)/deepclouds train $$run -o work/$(MODEL)_run
+	$(BIN)/deepclouds export work/$(MODEL)_run -o work/$(MODEL).onnx
 
 setup: $(STAMPS)/installed
 setup-test: $(STAMPS)/extra-test
