@@ -128,20 +128,28 @@ class Environment:
     def density(self, direction: Any) -> Any:
         """Density per steradian with which `sample` draws these directions."""
         t = self.types
-        n_rows, n_columns = self._shape
-        m = self._frame
-        x, y, z = (direction.x * float(m[0, i]) + direction.y * float(m[1, i]) + direction.z * float(m[2, i]) for i in range(3))
-        theta = dr.acos(dr.clip(y, -1, 1))
-        row = dr.minimum(t.UInt32(theta * (1 / dr.pi) * n_rows), n_rows - 1)
-        u = dr.atan2(x, -z) * (0.5 / dr.pi)
-        u = u - dr.floor(u)
-        column = dr.minimum(t.UInt32(u * n_columns), n_columns - 1)
-        offset = row * (n_columns + 1) + column
+        row, column = self._cell(direction)
+        offset = row * (self._shape[1] + 1) + column
         probability = (dr.gather(t.Float, self._row_sums, row + 1) - dr.gather(t.Float, self._row_sums, row)) * (
             dr.gather(t.Float, self._column_sums, offset + 1) - dr.gather(t.Float, self._column_sums, offset)
         )
         upper, lower = dr.gather(t.Float, self._edges, row), dr.gather(t.Float, self._edges, row + 1)
-        return probability * n_columns / (2 * dr.pi * (upper - lower))
+        return probability * self._shape[1] / (2 * dr.pi * (upper - lower))
+
+    def lookup(self, table: Any, direction: Any) -> Any:
+        """Values of `table`, one float a cell of the grid, row by row, in the cells that these directions fall into."""
+        row, column = self._cell(direction)
+        return dr.gather(self.types.Float, table, row * self._shape[1] + column)
+
+    def _cell(self, direction: Any) -> tuple[Any, Any]:
+        t = self.types
+        n_rows, n_columns = self._shape
+        m = self._frame
+        x, y, z = (direction.x * float(m[0, i]) + direction.y * float(m[1, i]) + direction.z * float(m[2, i]) for i in range(3))
+        theta = dr.acos(dr.clip(y, -1, 1))
+        u = dr.atan2(x, -z) * (0.5 / dr.pi)
+        u = u - dr.floor(u)
+        return dr.minimum(t.UInt32(theta * (n_rows / dr.pi)), n_rows - 1), dr.minimum(t.UInt32(u * n_columns), n_columns - 1)
 
     def _find(self, sums: Any, offset: Any, count: int, u: Any) -> tuple[Any, Any, Any]:
         """Index of the interval of a cumulative sum that holds `u`, and the interval's ends."""

@@ -75,7 +75,8 @@ class Renderer:
     environment_directions
         directions drawn from an environment at each sample of the cloud.
     interreflection
-        whether surfaces receive the cloud's light, and the cloud that of the surfaces, one reflection each.
+        whether surfaces receive the cloud's light, and the cloud that of the surfaces. Light that goes back and forth more than once,
+        and light from one surface to another, are left out.
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
@@ -102,6 +103,7 @@ class Renderer:
         started = time.perf_counter()
         self.scene = scene
         self._multiple = multiple
+        self._directions = environment_directions
         self._types = types_of(mitsuba())
         self._field = Field(self._types, scene.volume, scene.scale)
         self._network: NetworkScattering | None = None
@@ -109,11 +111,6 @@ class Renderer:
             if predictor is None:
                 raise InputError("multiple scattering needs a model; give one, or render single scattering alone (max_depth 2)")
             self._network = NetworkScattering(self._field, predictor)
-        shade = Shade(self._types, scene.surfaces)
-        sources = []
-        if scene.environment is not None:
-            sources.append((environment(self._types, scene.environment, shade), environment_directions))
-        self._lights = Lights(scene.suns, tuple(sources), shade)
         # Single scattering alone stops before light that surfaces have reflected, as volpath with max_depth 2 does.
         self._interreflection = interreflection and scene.surfaces is not None and scene.max_depth != 2
         self.model_hash: str | None = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
@@ -149,11 +146,12 @@ class Renderer:
         scattering = None
         if scene.max_depth != 2:
             scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
-        cloud, lights = Cloud(self._field, scene.albedo, scene.g, scattering), self._lights
+        cloud, lights = Cloud(self._field, scene.albedo, scene.g, scattering), self._lights()
         work = _Work(scene, cloud, lights, lights, types, samples, seed, self._interreflection)
+        work.spent("lights", started)
         if self._interreflection:
             clock = time.perf_counter()
-            reflectors = Reflectors(cloud, lights, seed & 0xFFFFFFFF)
+            reflectors = Reflectors(cloud, lights, seed & 0xFFFFFFFF, work.counts)
             work.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
             work.spent("probe", clock)
         width, height = scene.size
@@ -167,6 +165,14 @@ class Renderer:
         seconds = {"load": self._load_seconds, **work.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
         return RenderResult(rgb, channels["A"], channels, seconds, work.counts, scene.notes)
+
+    def _lights(self) -> Lights:
+        """The lights, with the tables that depend on them: made anew for each render."""
+        shade = Shade(self._types, self.scene.surfaces)
+        sources = []
+        if self.scene.environment is not None:
+            sources.append((environment(self._types, self.scene.environment, shade), self._directions))
+        return Lights(self.scene.suns, tuple(sources), shade)
 
 
 @dataclass
@@ -218,7 +224,7 @@ class _Work:
             colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
             if self.interreflection:
                 weight = dr.select(shown, through, 0)
-                thrown = reflected_from_cloud(self.cloud, self.on_surfaces, interaction, weight, numbers, self.counts)
+                thrown = reflected_from_cloud(self.cloud, self.on_cloud, interaction, weight, numbers, self.counts)
                 colours = [a + b for a, b in zip(colours, thrown, strict=True)]
             self._collect("surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)

@@ -144,10 +144,10 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
 
 
 class Reflectors:
-    """The surfaces around a cloud as a light source: what they reflect of the direct light reaches the cloud's samples.
+    """The surfaces around a cloud as a light source: what they reflect reaches the cloud's samples.
 
-    Directions are drawn from a table of what the surfaces look like from the middle of the cloud's box; the radiance itself is that of the
-    surface seen from the sample.
+    Directions are drawn from a table of what the surfaces look like from the middle of the cloud's box. The radiance of the lights that
+    they reflect is that of the surface seen from the sample; the cloud's own light that they send back is looked up in the table.
 
     Parameters
     ----------
@@ -155,38 +155,55 @@ class Reflectors:
         what dims the light on its way to the surfaces, and the lights.
     seed
         32 bits, of the table's random numbers.
+    counts
+        is updated.
     """
 
-    def __init__(self, cloud: Cloud, lights: Lights, seed: int) -> None:
+    def __init__(self, cloud: Cloud, lights: Lights, seed: int, counts: Counts) -> None:
         self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
-        self._table = Environment(self._types, self._nothing, self._probe(seed))
+        power, colours = self._probe(seed, counts)
+        self._table = Environment(self._types, self._nothing, power)
+        self._thrown = [self._types.Float(np.ascontiguousarray(colours[:, c], np.float32)) for c in range(colours.shape[1])]
         self.sample, self.density = self._table.sample, self._table.density
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance of the surface seen from `points`, 0 where there is none; see `LightSource`."""
+        interaction = self._seen(points, direction)
+        shown = plain(self._types, interaction.is_valid())
+        direct = reflected(self._cloud, self._lights, interaction, numbers.unrelated())
+        return [d + dr.select(shown, self._table.lookup(t, direction), 0) for d, t in zip(direct, self._thrown, strict=True)]
+
+    def _seen(self, points: Any, direction: Any) -> Any:
         mi = mitsuba()
-        ray = mi.Ray3f(mi.Point3f(points), mi.Vector3f(direction))
-        interaction = self._lights.shade.surfaces.ray_intersect(ray)
-        return reflected(self._cloud, self._lights, interaction, numbers.unrelated())
+        return self._lights.shade.surfaces.ray_intersect(mi.Ray3f(mi.Point3f(points), mi.Vector3f(direction)))
 
     def _nothing(self, direction: Any) -> list[Any]:
         return [dr.zeros(self._types.Float, dr.width(direction)) for _ in self._cloud.albedo]
 
-    def _probe(self, seed: int) -> NDArray[np.float64]:
+    def _probe(self, seed: int, counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Luminance (rows, columns) of the surfaces around the middle of the cloud's box; the cloud's light they send (cells, channels)."""
         types: ModuleType = self._types
         rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
         lower, upper = self._cloud.field.volume.bounds
         middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
-        total = np.zeros((rows, columns))
         random = np.random.default_rng(seed)
         n = rows * columns
+        power, thrown = np.zeros(n), np.zeros((n, len(self._cloud.albedo)))
         for part in range(_PROBE_PARTS):
             place = random.random(2)
             local = directions_of_cells(rows, columns, (float(place[0]), float(place[1]))).reshape(-1, 3).astype(np.float32)
             direction = types.Array3f(*(types.Float(np.ascontiguousarray(local[:, c])) for c in range(3)))
             numbers = Stratified(
-                types, dr.arange(types.UInt32, n), dr.full(types.UInt32, part, n), types.UInt32(_PROBE_PARTS), dr.opaque(types.UInt32, seed)
-            )
-            points = dr.zeros(types.Array3f, n) + middle
-            total += luminance(self.arriving(points, direction, numbers), n).reshape(rows, columns)
-        return total / _PROBE_PARTS
+                types,
+                dr.arange(types.UInt32, n),
+                dr.full(types.UInt32, part, n),
+                dr.opaque(types.UInt32, _PROBE_PARTS),
+                dr.opaque(types.UInt32, seed),
+            ).unrelated()
+            interaction = self._seen(dr.zeros(types.Array3f, n) + middle, direction)
+            dr.eval(interaction)
+            direct = reflected(self._cloud, self._lights, interaction, numbers)
+            sent = reflected_from_cloud(self._cloud, self._lights, interaction, dr.full(types.Float, 1, n), numbers, counts)
+            power += luminance([a + b for a, b in zip(direct, sent, strict=True)], n)
+            thrown += np.stack([np.array(value) for value in sent], axis=-1)
+        return power.reshape(rows, columns) / _PROBE_PARTS, thrown / _PROBE_PARTS

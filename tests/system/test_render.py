@@ -287,6 +287,24 @@ def test_the_plugin_renders_like_the_function(folder: Path, mi: Any) -> None:
     assert "DeepCloudsIntegrator" in str(named.integrator())
 
 
+def test_the_plugin_says_what_it_refuses(folder: Path, mi: Any) -> None:
+    (folder / "point.xml").write_text(SCENE.replace('type="constant"><rgb name="radiance" value="0.2 0.3 0.5"/>', 'type="point">'))
+    scene = mi.load_file(str(folder / "point.xml"))
+    plugin = mi.load_dict({"type": "deepclouds", "max_depth": 2})
+    with pytest.raises(InputError, match="PointLight"):
+        plugin.render(scene, spp=1)
+    # mi.render wraps every plugin's errors into its own.
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(scene, integrator=plugin, spp=1)
+    assert "PointLight" in str(caught.value.__cause__)
+
+
+def test_interreflection_adds_light_to_surfaces_and_cloud(folder: Path) -> None:
+    with_it, without = (load(folder / "scene.xml", predictor=Constant(), interreflection=i).render(16, seed=1) for i in (True, False))
+    for layer in ("surface.R", "volume_direct.R", "volume_indirect.R"):
+        assert with_it.channels[layer].mean() > 1.02 * without.channels[layer].mean(), layer
+
+
 def test_the_plugin_keeps_the_films_pixel_format(folder: Path, mi: Any) -> None:
     for pixel_format, channels in (("rgba", 4), ("luminance", 1)):
         text = SCENE.replace('<rfilter type="box"/>', f'<string name="pixel_format" value="{pixel_format}"/><rfilter type="box"/>')

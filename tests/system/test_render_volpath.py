@@ -69,7 +69,8 @@ SCENES = {
     "single, floor under a map": Scene(MAP, FLOOR.format(0.5) + BALL, max_depth=2),
     "homogeneous": Scene(SUN, density="homogeneous"),
     "dark floor": Scene(SUN, FLOOR.format(0.0)),
-    "floor": Scene(SUN, FLOOR.format(0.2), slack=0.03),
+    "floor": Scene(SUN, FLOOR.format(0.5), slack=0.01),
+    "floor under a map": Scene(MAP, FLOOR.format(0.5), slack=0.01),
 }
 
 
