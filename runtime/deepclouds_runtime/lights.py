@@ -76,6 +76,8 @@ class Environment:
         3 x 3 rotation from the table's frame to the world.
     shade
         what stands between the environment and a point.
+    uniform
+        share of the directions drawn uniformly: it bounds the weight of a light that the table does not know of.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Environment:
         power: NDArray[np.floating[Any]],
         frame: NDArray[np.floating[Any]] | None = None,
         shade: Shade | None = None,
+        uniform: float = _UNIFORM_SHARE,
     ) -> None:
         self.types = types
         self._shade = shade or Shade(types, None)
@@ -95,8 +98,8 @@ class Environment:
         weight = np.asarray(power, np.float64) * (edges[:-1] - edges[1:])[:, None]
         total = weight.sum()
         solid = np.broadcast_to((edges[:-1] - edges[1:])[:, None], weight.shape)
-        uniform = solid / solid.sum()
-        weight = (1 - _UNIFORM_SHARE) * weight / total + _UNIFORM_SHARE * uniform if total > 0 else uniform
+        evenly = solid / solid.sum()
+        weight = (1 - uniform) * weight / total + uniform * evenly if total > 0 else evenly
         # Cumulative sums a row and a column keep their digits where one sum over all cells would not.
         by_row = _cumulative(weight.sum(axis=1)[None])[0]
         by_column = _cumulative(weight)

@@ -20,6 +20,8 @@ from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
 _PROBE_ROWS = 32
 _PROBE_PARTS = 4
+# A sample beside the middle sees lit surfaces where the middle sees the cloud's own shadow: many directions ignore the table.
+_PROBE_UNIFORM = 0.5
 
 
 def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratified) -> list[Any]:
@@ -162,7 +164,7 @@ class Reflectors:
     def __init__(self, cloud: Cloud, lights: Lights, seed: int, counts: Counts) -> None:
         self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
         power, colours = self._probe(seed, counts)
-        self._table = Environment(self._types, self._nothing, power)
+        self._table = Environment(self._types, self._nothing, power, uniform=_PROBE_UNIFORM)
         self._thrown = [self._types.Float(np.ascontiguousarray(colours[:, c], np.float32)) for c in range(colours.shape[1])]
         self.sample, self.density = self._table.sample, self._table.density
 
