@@ -89,7 +89,7 @@ def test_drawn_parameters_keep_to_their_ranges_and_fill_them(family: str) -> Non
 
 def test_a_fixed_parameter_leaves_the_other_draws_alone() -> None:
     free, fixed = draw_parameters("cumulus", 5), draw_parameters("cumulus", 5, turrets=4)
-    assert dataclasses.replace(free, turrets=4) == fixed
+    assert {**dataclasses.asdict(free), "turrets": 4} == dataclasses.asdict(fixed)
 
 
 def test_the_usual_value_takes_its_share() -> None:

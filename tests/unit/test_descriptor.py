@@ -16,12 +16,14 @@ from deepclouds.volume.pyramid import filtered_levels, mean_extinction, volume_f
 
 def random_directions(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
     v = rng.normal(size=(n, 3))
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
+    unit: NDArray[np.float64] = v / np.linalg.norm(v, axis=1, keepdims=True)
+    return unit
 
 
 def rotation(rng: np.random.Generator) -> NDArray[np.float64]:
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
+    proper: NDArray[np.float64] = q * np.sign(np.linalg.det(q))
+    return proper
 
 
 def blob(rng: np.random.Generator, shape: tuple[int, int, int] = (11, 14, 17)) -> NDArray[np.float32]:
