@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from deepclouds.replacing import replacing
 
 BINS = 24
 
@@ -40,9 +41,5 @@ def write_predicted_plot(path: Path, prediction: NDArray[np.float32], label: NDA
         axes.errorbar(means[:, 0], means[:, 1], yerr=means[:, 2], fmt="o", markersize=4, color="C3", label="mean label, standard error")
     axes.set(xlim=(low, high), ylim=(low, high), xlabel="predicted j", ylabel="label j (Monte Carlo)", title=title)
     axes.legend(loc="upper left")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.png")
-    try:
-        figure.savefig(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path, ".png") as temporary:
+        figure.savefig(temporary, format="png")
