@@ -22,14 +22,15 @@ def write_predicted_plot(path: Path, prediction: NDArray[np.float32], label: NDA
 
     p, y = prediction.astype(np.float64), label.astype(np.float64)
     seen = y > 0
-    both = np.concatenate([p, y[seen]])
-    low, high = float(np.quantile(both, 0.001)) / 1.5, float(np.quantile(both, 0.999)) * 1.5
+    # A label may be smaller than any truth by orders of magnitude: the predictions set the axes, labels beyond stand at the edge.
+    low, high = float(np.quantile(p, 0.001)) / 1.5, float(np.quantile(p, 0.999)) * 1.5
+    shown = np.clip(y, low, high)
     figure = Figure(figsize=(6, 5.2), dpi=110, layout="constrained")
     axes = figure.add_subplot()
     if np.any(seen):
         limits = (np.log10(low), np.log10(high))
         counts = axes.hexbin(
-            p[seen], y[seen], xscale="log", yscale="log", gridsize=60, bins="log", mincnt=1, extent=(*limits, *limits), cmap="Blues"
+            p[seen], shown[seen], xscale="log", yscale="log", gridsize=60, bins="log", mincnt=1, extent=(*limits, *limits), cmap="Blues"
         )
         figure.colorbar(counts, label="samples")
     axes.plot([low, high], [low, high], color="0.3", linewidth=1, label="equal")
