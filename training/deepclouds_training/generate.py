@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import logging
 import multiprocessing
-import tomllib
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from deepclouds.backend import backend
 from deepclouds.errors import InputError
@@ -24,6 +22,7 @@ from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.volume import Volume
 from deepclouds.volume.pyramid import mean_extinction
 from deepclouds_training.clouds import FAMILIES, HELD_OUT, TRAINING, make_cloud
+from deepclouds_training.config_file import config_hash, read_toml, validated
 from deepclouds_training.points import sample_g, sample_points, sample_suns
 from deepclouds_training.shards import (
     MANIFEST,
@@ -106,17 +105,12 @@ class GenerateConfig(BaseModel):
 
     def hash(self) -> str:
         """SHA-256 of the resolved configuration."""
-        return hashlib.sha256(json.dumps(self.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+        return config_hash(self)
 
 
 def load_config(path: Path) -> GenerateConfig:
     """Read a TOML file into a `GenerateConfig`; InputError when it is missing, malformed or holds unknown keys."""
-    try:
-        return GenerateConfig(**tomllib.loads(path.read_text()))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (tomllib.TOMLDecodeError, ValidationError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: {error}") from error
+    return validated(GenerateConfig, read_toml(path), str(path))
 
 
 class _Plan:
@@ -263,7 +257,8 @@ def generate(
                 if not console.is_terminal and (len(done) % 10 == 0 or len(done) == total):
                     log.info("%d of %d shards", len(done), total)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # Waiting for the cloud in the making takes a moment; without it the interpreter's exit races with the pool's.
+            pool.shutdown(cancel_futures=True)
 
 
 def _place(config: GenerateConfig, index: int) -> float:
@@ -301,6 +296,8 @@ def main(argv: Sequence[str], prog: str) -> int:
     parser.add_argument("--backend", choices=("llvm", "cuda"), default="llvm")
     parser.add_argument("--limit", type=int, help="make at most so many shards now")
     arguments = parser.parse_args(argv)
+    if arguments.limit is not None and arguments.limit < 1:
+        raise InputError(f"--limit {arguments.limit}: at least one shard must be allowed")
     if arguments.tracer == "mitsuba":
         import mitsuba as mi
 

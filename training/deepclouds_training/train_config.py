@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from deepclouds.errors import InputError
+from deepclouds_training.config_file import config_hash, read_toml, validated
 from deepclouds_training.network import NetworkConfig
 from deepclouds_training.samples import SampleConfig
 
@@ -70,7 +68,7 @@ class TrainConfig(BaseModel):
     @property
     def hash(self) -> str:
         """sha256 of the resolved configuration."""
-        return hashlib.sha256(json.dumps(self.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+        return config_hash(self)
 
 
 def read_config(path: Path, overrides: Mapping[str, Any]) -> TrainConfig:
@@ -81,13 +79,7 @@ def read_config(path: Path, overrides: Mapping[str, Any]) -> TrainConfig:
     InputError
         for a file that is missing or no TOML, and for unknown keys or values out of range.
     """
-    try:
-        given = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the TOML file of the run") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: no valid TOML ({error})") from error
-    return checked({**given, **{key: value for key, value in overrides.items() if value is not None}}, str(path))
+    return checked({**read_toml(path), **{key: value for key, value in overrides.items() if value is not None}}, str(path))
 
 
 def checked(values: Mapping[str, Any], source: str) -> TrainConfig:
@@ -98,19 +90,8 @@ def checked(values: Mapping[str, Any], source: str) -> TrainConfig:
     InputError
         for unknown keys, missing ones, or values out of range.
     """
-    try:
-        config = TrainConfig.model_validate(dict(values))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{source}: {where}: {first['msg']} (got {first['input']!r}); the keys are {_keys()}") from error
+    config = validated(TrainConfig, values, source)
     pool = config.samples.shards * config.samples.queries
     if config.batch > pool:
         raise InputError(f"{source}: batch {config.batch} exceeds a pool of {pool} samples; raise samples.shards or samples.queries")
     return config
-
-
-def _keys() -> str:
-    tables: dict[str, type[BaseModel]] = {"network": NetworkConfig, "samples": SampleConfig}
-    plain = [name for name in TrainConfig.model_fields if name not in tables]
-    return ", ".join(plain + [f"{table}.{name}" for table, model in tables.items() for name in model.model_fields])
