@@ -36,15 +36,9 @@ def optical_depth(
         lanes to compute; the others return 0.
     """
     types = field.types
-    enter, leave = field.intersect(origin, direction)
-    first = dr.maximum(enter, start)
-    length = dr.select(active, dr.maximum(dr.minimum(leave, end) - first, 0), 0)
-    steps = dr.ceil(length / dr.opaque(types.Float, field.step))
-    width = length / dr.maximum(steps, 1)
-    base = field.to_unit(origin)
-    along = field.direction_to_unit(direction)
-    tau = dr.zeros(types.Float, dr.width(length))
-    index = dr.zeros(types.Float, dr.width(length))
+    first, steps, width, base, along = _march(field, origin, direction, start, end, active)
+    tau = dr.zeros(types.Float, dr.width(steps))
+    index = dr.zeros(types.Float, dr.width(steps))
     going = active & (steps > 0)
     while going:
         distance = first + (index + jitter) * width
@@ -62,17 +56,11 @@ def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any,
     distance is that of its end.
     """
     types = field.types
-    enter, leave = field.intersect(origin, direction)
-    first = dr.maximum(enter, start)
-    length = dr.select(active, dr.maximum(dr.minimum(leave, end) - first, 0), 0)
-    steps = dr.ceil(length / dr.opaque(types.Float, field.step))
-    width = length / dr.maximum(steps, 1)
-    base = field.to_unit(origin)
-    along = field.direction_to_unit(direction)
-    tau = dr.zeros(types.Float, dr.width(length))
-    index = dr.zeros(types.Float, dr.width(length))
-    found = first + dr.zeros(types.Float, dr.width(length))
-    density = dr.zeros(types.Float, dr.width(length))
+    first, steps, width, base, along = _march(field, origin, direction, start, end, active)
+    tau = dr.zeros(types.Float, dr.width(steps))
+    index = dr.zeros(types.Float, dr.width(steps))
+    found = first + dr.zeros(types.Float, dr.width(steps))
+    density = dr.zeros(types.Float, dr.width(steps))
     going = active & (steps > 0)
     while going:
         near = first + index * width
@@ -86,3 +74,12 @@ def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any,
         index += 1
         going = going & (index < steps) & ~inside
     return found, density
+
+
+def _march(field: Field, origin: Any, direction: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """A segment inside the box in equal steps: where it starts, their number and width, and the ray in the unit cube's coordinates."""
+    enter, leave = field.intersect(origin, direction)
+    first = dr.maximum(enter, start)
+    length = dr.select(active, dr.maximum(dr.minimum(leave, end) - first, 0), 0)
+    steps = dr.ceil(length / dr.opaque(field.types.Float, field.step))
+    return first, steps, length / dr.maximum(steps, 1), field.to_unit(origin), field.direction_to_unit(direction)

@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "python -m deepclouds_ru
         if min(arguments.size, arguments.spp, arguments.reference_spp) < 1:
             raise InputError("size and samples are whole numbers above 0")
         arguments.out.mkdir(parents=True, exist_ok=True)
-        _run(arguments, print)
+        _run(arguments, partial(print, flush=True))
     except InputError as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
