@@ -11,6 +11,8 @@ BIN := $(VENV)/bin
 STAMPS := $(VENV)/stamps
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 DEBIAN := g++ python3-venv python3-dev libopenvdb-dev libboost-iostreams-dev libllvm19
+# Runs a command and says how long it took.
+timed = started=$$(date +%s); $(1) && echo "  $$(( $$(date +%s) - started )) s"
 
 # The editable install knows the modules by name: one more or less asks for it anew (seconds; nothing is compiled).
 LAYOUT := $(STAMPS)/layout-$(shell find deepclouds training/deepclouds_training runtime/deepclouds_runtime -name '*.py' | LC_ALL=C sort | cksum | cut -d' ' -f1)
@@ -86,13 +88,13 @@ $(STAMPS)/python:
 	command -v $(PYTHON) >/dev/null && $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "$(PYTHON) is not Python 3.11 or newer; name one: make PYTHON=/path/to/python3.11"; exit 1; }
 	echo "Creating $(VENV)"
-	$(PYTHON) -m venv $(VENV)
+	$(call timed,$(PYTHON) -m venv $(VENV))
 	mkdir -p $(STAMPS)
 	touch $@
 
 $(STAMPS)/build-tools: constraints.txt | $(STAMPS)/python
 	echo "Installing the build tools"
-	$(PIP) install -c constraints.txt scikit-build-core nanobind cmake ninja
+	$(call timed,$(PIP) install -c constraints.txt scikit-build-core nanobind cmake ninja)
 	touch $@
 
 $(LAYOUT): | $(STAMPS)/python
@@ -102,13 +104,13 @@ $(LAYOUT): | $(STAMPS)/python
 # Built without isolation, with the pinned tools: what is compiled once stays in build/ and is not compiled again.
 $(STAMPS)/installed: pyproject.toml constraints.txt LICENSE $(NATIVE) $(STAMPS)/build-tools $(LAYOUT)
 	echo "Installing deepclouds, its Python packages and its OpenVDB module (minutes the first time)"
-	$(PIP) install -c constraints.txt --no-build-isolation -e .
+	$(call timed,$(PIP) install -c constraints.txt --no-build-isolation -e .)
 	touch $@
 
 # The name finds the editable install, so only the extra's packages are added.
 $(STAMPS)/extra-%: $(STAMPS)/installed
 	echo "Installing the Python packages for '$*'"
-	$(PIP) install -c constraints.txt "deepclouds[$*]"
+	$(call timed,$(PIP) install -c constraints.txt "deepclouds[$*]")
 	touch $@
 
 clean:
