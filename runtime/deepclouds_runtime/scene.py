@@ -22,6 +22,8 @@ _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 _UNLIMITED = 0xFFFFFFFF
 # A homogeneous ball becomes a grid of this many voxels a side, each filled by the share of it that lies inside.
 _BALL_VOXELS = 96
+# All channels of an image this large take 12 GB.
+_MOST_PIXELS = 1 << 27
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     InputError
         for everything outside of what we render: more or less than one cloud, chromatic extinction, varying albedo, phase functions other
         than `hg` and `isotropic`, emitters other than `directional`, `constant` and `envmap`, cameras other than `perspective`, crop
-        windows, path lengths other than -1 and 2, surfaces that let light through.
+        windows, path lengths other than -1 and 2, surfaces that let light through, media outside of the cloud, images without pixels.
     """
     notes: list[str] = []
     camera = _camera(scene, sensor, notes)
@@ -106,6 +108,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     if len(containers) != 1:
         found = "no shape has an interior medium" if not containers else f"{len(containers)} shapes have an interior medium"
         raise InputError(f"{found}; deepclouds renders scenes with exactly one cloud: a shape with a null BSDF and a medium inside")
+    _check_camera_medium(camera, containers[0])
     volume, scale, albedo, g = _read_medium(containers[0])
     suns, environment = read_lights(scene)
     integrator = scene.integrator()
@@ -116,6 +119,14 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     return CloudScene(
         volume, scale, albedo, g, suns, environment, surfaces_alone(surfaces), camera, hide_emitters, check_depth(max_depth), tuple(notes)
     )
+
+
+def check_size(width: int, height: int) -> None:
+    """Refuse, by InputError, an image without pixels and one that would not fit into memory."""
+    if width < 1 or height < 1:
+        raise InputError(f"an image of {width} x {height} pixels: it needs at least one pixel each way")
+    if width * height > _MOST_PIXELS:
+        raise InputError(f"an image of {width} x {height} pixels: at most {_MOST_PIXELS:,} fit; choose a smaller size")
 
 
 def check_depth(max_depth: int) -> int:
@@ -145,6 +156,7 @@ def _camera(scene: Any, sensor: Any, notes: list[str]) -> Any:
     if sensor.class_name() != "PerspectiveCamera":
         raise InputError(f"sensor {sensor.class_name()}: deepclouds renders the `perspective` sensor only")
     film = sensor.film()
+    check_size(*(int(n) for n in film.size()))
     if tuple(film.crop_size()) != tuple(film.size()):
         raise InputError(
             f"film: a crop window of {tuple(film.crop_size())} in {tuple(film.size())}: render the whole image and crop it afterwards"
@@ -157,6 +169,12 @@ def _camera(scene: Any, sensor: Any, notes: list[str]) -> Any:
     return sensor
 
 
+def _check_camera_medium(camera: Any, container: Any) -> None:
+    medium = camera.get_medium()
+    if medium is not None and medium is not container.interior_medium():
+        raise InputError(f"sensor '{camera.id()}' stands in a medium other than the cloud; leave out the medium of the sensor")
+
+
 def _split_shapes(scene: Any) -> tuple[list[Any], list[Any]]:
     """Containers (a medium inside, nothing to see outside) and surfaces; shapes that neither hold nor show anything are left out."""
     mi = mitsuba()
@@ -166,6 +184,8 @@ def _split_shapes(scene: Any) -> tuple[list[Any], list[Any]]:
         bsdf = shape.bsdf()
         if shape.is_emitter():
             raise InputError(f"{name} is an area light; the lights we know are `directional`, `constant` and `envmap`")
+        if shape.exterior_medium() is not None:
+            raise InputError(f"{name} has a medium outside; deepclouds renders one cloud in empty space: leave out its `exterior`")
         null = bsdf is None or bsdf.class_name() == "Null"
         if shape.interior_medium() is not None:
             if not null:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,14 +30,8 @@ NULL = '<bsdf type="null"/>'
 
 
 @pytest.fixture(autouse=True)
-def mi() -> Iterator[Any]:
-    import mitsuba
-
-    before = mitsuba.variant()
-    mitsuba.set_variant("llvm_ad_rgb")
-    yield mitsuba
-    if before is not None:
-        mitsuba.set_variant(before)
+def mi(llvm_mitsuba: ModuleType) -> ModuleType:
+    return llvm_mitsuba
 
 
 @pytest.fixture
@@ -151,6 +145,14 @@ REFUSED = {
     "rayleigh": (cloud(phase='<phase type="rayleigh"/>'), "phase function Rayleigh"),
     "tabphase": (cloud(phase='<phase type="tabphase"><string name="values" value="0.5, 1, 1.5"/></phase>'), "phase function Tab"),
     "grid of colours": (cloud().replace("density.vol", "colours.vol"), "chromatic extinction"),
+    "medium outside a surface": (
+        cloud() + '<shape type="sphere"><bsdf type="diffuse"/><medium type="homogeneous" name="exterior"/></shape>',
+        "has a medium outside",
+    ),
+    "medium outside a null surface": (
+        cloud() + '<shape type="sphere"><bsdf type="null"/><medium type="homogeneous" name="exterior"/></shape>',
+        "has a medium outside",
+    ),
     "varying albedo": (
         cloud(albedo=GRID.replace("sigma_t", "albedo").format(turn=PLACE, extra="")),
         "albedo varies",
@@ -185,6 +187,7 @@ def test_refusals_name_what_they_refuse(mi: Any, folder: Path, name: str) -> Non
     ("camera", "said"),
     [
         (CAMERA.format(film=BOX).replace("perspective", "orthographic"), "Orthographic"),
+        (CAMERA.format(film=BOX).replace('"perspective">', '"perspective"><medium type="homogeneous"/>'), "stands in a medium"),
         (CAMERA.format(film=BOX).replace('"perspective">', '"thinlens"><float name="aperture_radius" value="0.1"/>'), "ThinLens"),
         (CAMERA.format(film=BOX + '<integer name="crop_width" value="2"/><integer name="crop_height" value="2"/>'), "crop"),
     ],
