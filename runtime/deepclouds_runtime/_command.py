@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,7 +84,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     volume.add_argument("--albedo", type=_numbers((1, 3)), metavar="A|R,G,B", help="single-scattering albedo (default 1)")
     volume.add_argument("--g", type=float, help="Henyey-Greenstein parameter, -1 to 1 (default 0.85)")
     volume.add_argument(
-        "--sun", type=_numbers((2,)), metavar=_PAIR, help="where the sun stands, degrees; azimuth 0 is +Z and grows to +X (default 65,35)"
+        "--sun", type=_numbers((2,)), metavar=_PAIR, help="where the sun stands, degrees; azimuth 0 is +Z and grows to +X (default 100,35)"
     )
     volume.add_argument("--irradiance", type=_numbers((1, 3)), metavar="E|R,G,B", help="of the sun, perpendicular to it (default 12)")
     volume.add_argument("--env", metavar="FILE", help="environment map for light and background, in place of sun and sky")
@@ -97,6 +99,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 
 _VOLUME = ("optical_depth", "extinction", "albedo", "g", "sun", "irradiance", "env", "sky", "up", "view", "size")
 _BOTH = ("max_depth", "hide_emitters")
+_MAY_BE_NEGATIVE = ("--sun", "--view", "--albedo", "--irradiance", "--sky", "--size")
 
 
 def run(argv: Sequence[str], prog: str) -> int:
@@ -118,22 +121,37 @@ def run(argv: Sequence[str], prog: str) -> int:
     if arguments.env_directions is not None:
         how["environment_directions"] = arguments.env_directions
 
-    from deepclouds_runtime.loading import load
-    from deepclouds_runtime.output import save
+    import numpy as np
 
+    from deepclouds_runtime._mitsuba import mitsuba
+    from deepclouds_runtime.loading import load
+    from deepclouds_runtime.output import check_exposure, save
+
+    check_exposure(arguments.exposure)
     defines = dict(_define(text) for text in arguments.defines)
     renderer = load(arguments.input, defines=defines, model=arguments.model, threads=arguments.threads, **options, **how)
     say: Callable[[str], None] = (lambda text: None) if arguments.quiet else print
     _describe(renderer, say)
     with _progress(arguments.quiet) as progress:
         result = renderer.render(arguments.spp, arguments.seed, progress)
+    sensor = renderer.scene.sensor
+    camera = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    fov = np.ravel(np.array(mitsuba().traverse(sensor)["x_fov"]))
     settings = {
+        "command": shlex.join([*prog.split(), *argv]),
+        "version": version("deepclouds"),
+        "mitsuba_variant": mitsuba().variant(),
         "input": arguments.input,
         "spp": renderer.samples(arguments.spp),
         "seed": arguments.seed,
         "defines": defines,
         "options": options,
         **how,
+        "environment_directions": renderer.environment_directions,
+        "size": renderer.scene.size,
+        "camera": {"to_world": camera.tolist(), "fov": [float(v) for v in fov]},
+        "suns": [asdict(sun) for sun in renderer.scene.suns],
+        "hide_emitters": renderer.scene.hide_emitters,
         "extinction": renderer.scene.scale,
         "albedo": renderer.scene.albedo,
         "g": renderer.scene.g,
@@ -147,10 +165,10 @@ def run(argv: Sequence[str], prog: str) -> int:
 
 
 def _negative_pairs(argv: Sequence[str]) -> list[str]:
-    """Join `--sun -30,40` to `--sun=-30,40`: argparse takes a value that starts with a minus sign and holds a comma for an option."""
+    """Join `--sun -30,40` to `--sun=-30,40`: argparse takes what starts with a minus sign and is no plain number for an option."""
     joined: list[str] = []
     for text in argv:
-        if joined and joined[-1] in ("--sun", "--view") and re.match(r"-[\d.]", text):
+        if joined and joined[-1] in _MAY_BE_NEGATIVE and re.match(r"-[\d.]", text):
             joined[-1] += f"={text}"
         else:
             joined.append(text)

@@ -18,6 +18,7 @@ from deepclouds_runtime.volume_scene import options_from, volume_scene
 
 # How a render is done, whatever the input.
 RENDER_OPTIONS = ("multiple", "environment_directions", "interreflection")
+_MOST_THREADS = 1024
 SCENE_OPTIONS = ("sensor", "max_depth", "hide_emitters")
 
 
@@ -88,6 +89,8 @@ def _set_threads(threads: int) -> None:
 
     if threads < 1:
         raise InputError(f"threads = {threads}: at least one is needed")
+    if threads > _MOST_THREADS:
+        raise InputError(f"threads = {threads}: at most {_MOST_THREADS}; more than there are processors only slow the render down")
     dr.set_thread_count(threads)
 
 

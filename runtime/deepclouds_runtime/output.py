@@ -9,10 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from deepclouds.errors import InputError
 from deepclouds.exr import write_exr, write_png
 from deepclouds_runtime.renderer import RenderResult
 
 ATTRIBUTE = "deepclouds"
+_MOST_STOPS = 60
+
+
+def check_exposure(stops: float) -> None:
+    """Refuse, by InputError, an exposure that turns every image black, white, or into NaN."""
+    if not -_MOST_STOPS <= stops <= _MOST_STOPS:
+        raise InputError(f"exposure = {stops:g}: give stops between -{_MOST_STOPS} and {_MOST_STOPS}")
 
 
 def save(
@@ -38,8 +46,10 @@ def save(
     Raises
     ------
     InputError
-        when a folder is missing or the image is not finite.
+        when a folder is missing, the image is not finite, or the exposure is out of range; nothing is written then.
     """
+    if png is not None:
+        check_exposure(exposure)
     record = {k: v for k, v in (settings or {}).items() if v is not None}
     attributes: dict[str, str | float | int] = {
         "software": "deepclouds",

@@ -26,6 +26,8 @@ Image = NDArray[np.float32]
 
 # Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB.
 _PASS = 1 << 19
+# A pixel's samples are in flight together.
+_MOST_SAMPLES = 1 << 20
 COLOURS = ("R", "G", "B")
 LAYERS = ("volume_direct", "volume_indirect", "surface", "background")
 
@@ -103,7 +105,7 @@ class Renderer:
         started = time.perf_counter()
         self.scene = scene
         self._multiple = multiple
-        self._directions = environment_directions
+        self.environment_directions = environment_directions
         self._types = types_of(mitsuba())
         self._field = Field(self._types, scene.volume, scene.scale)
         self._network: NetworkScattering | None = None
@@ -121,6 +123,8 @@ class Renderer:
         count = int(self.scene.sensor.sampler().sample_count()) if spp is None else int(spp)
         if count < 1:
             raise InputError(f"spp = {count}: a pixel needs at least one sample")
+        if count > _MOST_SAMPLES:
+            raise InputError(f"spp = {count}: at most {_MOST_SAMPLES:,}; average several renders with different seeds")
         return count
 
     def render(self, spp: int | None = None, seed: int = 0, progress: Callable[[float], None] | None = None) -> RenderResult:
@@ -138,7 +142,7 @@ class Renderer:
         Raises
         ------
         InputError
-            when `spp` is below 1.
+            when `spp` is below 1 or above 1,048,576.
         """
         scene, types = self.scene, self._types
         samples = self.samples(spp)
@@ -171,7 +175,7 @@ class Renderer:
         shade = Shade(self._types, self.scene.surfaces)
         sources = []
         if self.scene.environment is not None:
-            sources.append((environment(self._types, self.scene.environment, shade), self._directions))
+            sources.append((environment(self._types, self.scene.environment, shade), self.environment_directions))
         return Lights(self.scene.suns, tuple(sources), shade)
 
 

@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
-from deepclouds_runtime.scene import CloudScene, check_depth, read_lights
+from deepclouds_runtime.scene import CloudScene, check_depth, check_size, read_lights
 
 _FOV = 30.0
-_MARGIN = 1.08
+_MARGIN = 1.15
+# Light and extinction beyond it come near float32's limit when they are multiplied.
+_LARGEST = 1e15
 _DEFAULT_OPTICAL_DEPTH = 60.0
-_DEFAULT_SUN = (65.0, 35.0)
+_DEFAULT_SUN = (100.0, 35.0)
+# Thinner voxels do not push the camera away: a haze around a cloud is no part of the picture's subject.
+_FRAMED = 0.01
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class VolumeOptions:
         Henyey-Greenstein parameter.
     sun
         azimuth and elevation of the sun. With ``up = "y"`` azimuth 0 is +Z and grows toward +X; with ``up = "z"`` it is +X and grows
-        toward +Y. By default (65, 35), or no sun when `env` is given.
+        toward +Y. By default (100, 35), or no sun when `env` is given.
     irradiance
         of the sun, perpendicular to it: one value or three.
     env
@@ -100,6 +104,8 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
     try:
         scene = mi.load_dict(description(volume, options))
     except RuntimeError as error:
+        if "envmap" in str(error):
+            raise InputError(f"{options.env}: not an environment map that Mitsuba reads; give a latitude-longitude .exr or .hdr") from error
         raise InputError(f"{source}: Mitsuba cannot build the scene around it ({error})") from error
     suns, environment = read_lights(scene)
     channels = len(mi.Spectrum())
@@ -179,30 +185,40 @@ def _check(options: VolumeOptions) -> None:
     for name in ("albedo", "irradiance", "sky"):
         values = getattr(options, name)
         if len(values) not in (1, 3) or not np.all(np.isfinite(values)) or min(values) < 0:
-            refuse(name, "one or three numbers that are not negative")
+            refuse(name, "give one or three finite numbers that are not negative")
+        if max(values) > _LARGEST:
+            refuse(name, f"give values of at most {_LARGEST:g}; larger ones overflow in the image")
     if max(options.albedo) > 1:
         refuse("albedo", "values lie in 0 to 1")
     if not -1 < options.g < 1:
-        refuse("g", "a value between -1 and 1, both excluded")
+        refuse("g", "give a value between -1 and 1, both excluded")
     if options.up not in ("y", "z"):
-        refuse("up", "'y' or 'z'")
+        refuse("up", "choose 'y' or 'z'")
     for name in ("optical_depth", "extinction"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value >= 0):
-            refuse(name, "a finite number that is not negative")
+            refuse(name, "give a finite number that is not negative")
+    if options.optical_depth is not None and options.optical_depth > _LARGEST:
+        refuse("optical_depth", f"give at most {_LARGEST:g}")
     if options.optical_depth is not None and options.extinction is not None:
         raise InputError("optical_depth and extinction are both given: each sets the density's scale; leave one out")
-    if min(options.size) < 1 or len(options.size) != 2:
-        refuse("size", "width and height of at least one pixel")
+    if len(options.size) != 2 or min(options.size) < 1:
+        refuse("size", "give width and height of at least one pixel")
+    check_size(*options.size)
     for name in ("sun", "view"):
         value = getattr(options, name)
         if value is not None and (len(value) != 2 or not np.all(np.isfinite(value))):
-            refuse(name, "azimuth and elevation in degrees")
+            refuse(name, "give azimuth and elevation in degrees")
+        if value is not None and abs(value[1]) > 90:
+            refuse(name, "the elevation lies between -90 and 90 degrees; turn the azimuth by 180 to look from the other side")
 
 
 def extinction(volume: Volume, options: VolumeOptions, source: str) -> float:
     """Extinction at density 1, 1 / world length, that the options ask for."""
     if options.extinction is not None:
+        thickest = options.extinction * float(volume.density.max())
+        if thickest > _LARGEST:
+            raise InputError(f"extinction = {options.extinction:g}: the densest voxel gets {thickest:g}; it may have {_LARGEST:g} at most")
         return options.extinction
     depth = _DEFAULT_OPTICAL_DEPTH if options.optical_depth is None else options.optical_depth
     edges = volume.voxel_size
@@ -229,7 +245,7 @@ def _direction(angles: tuple[float, float], up: str) -> NDArray[np.float64]:
 
 
 def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
-    """Perspective camera as near as the box around the filled voxels allows."""
+    """Perspective camera as near as the filled voxels allow."""
     import mitsuba as mi
 
     toward = _direction(options.view, options.up)
@@ -240,8 +256,11 @@ def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     above = np.cross(right, forward)
-    corners = _filled_corners(volume)
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    corners = _framed_corners(volume)
+    # In the middle of what the picture shows, which is seldom that of the box.
+    basis = np.stack([right, above, forward])
+    along = corners @ basis.T
+    middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ basis
     relative = corners - middle
     width, height = options.size
     tangent = np.tan(np.deg2rad(_FOV / 2))
@@ -268,15 +287,18 @@ def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
     }
 
 
-def _filled_corners(volume: Volume) -> NDArray[np.float64]:
-    """World corners of the box around the filled voxels, or of the whole box when all are empty."""
-    lowest, highest = np.zeros(3), np.array(volume.resolution, np.float64)
-    filled = volume.density > 0
-    if filled.any():
-        for axis in range(3):
-            places = np.flatnonzero(filled.any(axis=tuple(a for a in range(3) if a != 2 - axis)))
-            lowest[axis], highest[axis] = places[0], places[-1] + 1
-    unit = np.where(np.array(list(np.ndindex(2, 2, 2))) == 1, highest, lowest) / np.array(volume.resolution)
+def _framed_corners(volume: Volume) -> NDArray[np.float64]:
+    """World corners (n, 3) of the voxels at the ends of each row along x that holds something; of the box when all are empty."""
+    filled = volume.density > _FRAMED * volume.density.max()
+    rows = np.argwhere(filled.any(axis=2))
+    if len(rows):
+        first = filled.argmax(axis=2)[tuple(rows.T)]
+        last = filled.shape[2] - filled[:, :, ::-1].argmax(axis=2)[tuple(rows.T)]
+        ends = np.concatenate([np.column_stack([x, rows[:, 1], rows[:, 0]]) for x in (first, last)]).astype(np.float64)
+        grid = np.concatenate([ends + np.array([0, dy, dz]) for dy, dz in np.ndindex(2, 2)])
+    else:
+        grid = np.array(list(np.ndindex(2, 2, 2))) * np.array(volume.resolution, np.float64)
+    unit = grid / np.array(volume.resolution)
     corners: NDArray[np.float64] = unit @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
     return corners
 
@@ -287,11 +309,16 @@ def options_from(given: dict[str, Any]) -> VolumeOptions:
     Raises
     ------
     InputError
-        for an unknown name.
+        for an unknown name, and for names that exclude each other.
     """
     unknown = sorted(set(given) - set(NAMES))
     if unknown:
         raise InputError(f"unknown option '{unknown[0]}' for a volume; there are: {', '.join(NAMES)}")
+    if "env" in given:
+        if "sky" in given:
+            raise InputError("env and sky are both given: the map is the sky; leave one out")
+        if "irradiance" in given and "sun" not in given:
+            raise InputError(f"irradiance = {given['irradiance']}: with an environment map there is no sun unless sun says where; add it")
     values = dict(given)
     for name in ("albedo", "irradiance", "sky"):
         if name in values:

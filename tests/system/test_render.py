@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -69,14 +68,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def mi() -> Iterator[ModuleType]:
-    import mitsuba
-
-    before = mitsuba.variant()
-    mitsuba.set_variant("llvm_ad_rgb")
-    yield mitsuba
-    if before is not None:
-        mitsuba.set_variant(before)
+def mi(llvm_mitsuba: ModuleType) -> ModuleType:
+    return llvm_mitsuba
 
 
 def _layers_add_up(channels: dict[str, Any]) -> None:
@@ -100,6 +93,12 @@ def test_the_command_writes_every_channel_and_its_settings(folder: Path, tmp_pat
     assert settings["spp"] == 2
     assert settings["seed"] == 5
     assert settings["defines"] == {"size": "10"}
+    # Enough to make it again.
+    assert "--seed 5" in settings["command"]
+    assert settings["version"]
+    assert settings["mitsuba_variant"] == "llvm_ad_rgb"
+    assert len(settings["suns"][0]["omega_sun"]) == 3
+    assert np.shape(settings["camera"]["to_world"]) == (4, 4)
     assert out.with_suffix(".png").is_file()
     printed = capsys.readouterr().out
     assert "queries" in printed
@@ -250,6 +249,19 @@ def test_passes_do_not_show(folder: Path, monkeypatch: pytest.MonkeyPatch) -> No
         (["density.vol", "--grid", "x"], "one grid"),
         (["density.vol", "-Dx=1"], "no meaning for a volume"),
         (["density.vol", "--model", "missing.onnx"], "missing.onnx"),
+        (["scene.xml", "-Dsize=0"], "0 x 0 pixels"),
+        (["density.vol", "--size", "1000000x1000000"], "smaller size"),
+        (["density.vol", "--spp", "1000000000", "--max-depth", "2"], "spp = 1000000000"),
+        (["density.vol", "--threads", "99999999999"], "threads = 99999999999"),
+        (["density.vol", "--exposure", "nan"], "exposure = nan"),
+        (["density.vol", "--exposure", "1e9", "--png"], "exposure = 1e+09"),
+        (["density.vol", "--extinction", "1e38"], "extinction = 1e+38"),
+        (["density.vol", "--optical-depth", "1e38"], "optical_depth = 1e+38"),
+        (["density.vol", "--irradiance", "1e38"], "at most"),
+        (["density.vol", "--irradiance", "-3,1,1"], "(-3.0, 1.0, 1.0)"),
+        (["density.vol", "--sun", "0,100"], "between -90 and 90"),
+        (["density.vol", "--env", "text.txt", "--sky", "1"], "env and sky"),
+        (["density.vol", "--env", "text.txt", "--irradiance", "1"], "there is no sun"),
     ],
 )
 def test_bad_input_is_named(folder: Path, tmp_path: Path, arguments: list[str], said: str) -> None:
@@ -259,6 +271,26 @@ def test_bad_input_is_named(folder: Path, tmp_path: Path, arguments: list[str], 
         main([str(folder / arguments[0]), *arguments[1:], "-o", str(tmp_path / "image.exr")])
     assert said in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_is_no_environment_map_is_named(folder: Path) -> None:
+    (folder / "text.txt").write_text("no map")
+    with pytest.raises(InputError, match=r"text\.txt: not an environment map"):
+        load(folder / "density.vol", env=str(folder / "text.txt"), max_depth=2)
+
+
+@pytest.mark.parametrize("view", [(0, 5), (40, 60), (200, -90)])
+def test_the_camera_frames_the_cloud_tightly(tmp_path: Path, view: tuple[float, float]) -> None:
+    density = np.zeros((20, 24, 30), np.float32)
+    density[3:9, 4:9, 2:25] = 1  # off the middle of the grid
+    density[9:17, 4:20, 2:6] = 0.5
+    density[19, 23, 29] = 1e-4  # haze far away
+    write_vol(tmp_path / "ell.vol", Volume.from_box(density, (0, 0, 0), (30, 24, 20)))
+    result = load(tmp_path / "ell.vol", view=view, size=(40, 30), optical_depth=2000.0, max_depth=2).render(4)
+    shown = result.channels["volume_opacity"] > 0.5
+    assert shown[1:-1, 1:-1].sum() == shown.sum()
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    assert max(np.ptp(rows) / 30, np.ptp(columns) / 40) > 0.7
 
 
 @pytest.mark.parametrize("out", ["nowhere/image.exr", "image.png"])
