@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -26,13 +27,33 @@ def public_scenes() -> Path:
     return folder
 
 
-@pytest.fixture
-def scalar_mitsuba() -> Iterator[ModuleType]:
-    """Mitsuba with the variant scalar_rgb; the variant that was set before comes back afterwards."""
+@contextmanager
+def _variant(name: str) -> Iterator[ModuleType]:
     import mitsuba
 
     before = mitsuba.variant()
-    mitsuba.set_variant("scalar_rgb")
+    mitsuba.set_variant(name)
     yield mitsuba
     if before is not None:
         mitsuba.set_variant(before)
+
+
+@pytest.fixture
+def scalar_mitsuba() -> Iterator[ModuleType]:
+    """Mitsuba with the variant scalar_rgb; the variant that was set before comes back afterwards."""
+    with _variant("scalar_rgb") as module:
+        yield module
+
+
+@pytest.fixture
+def llvm_mitsuba() -> Iterator[ModuleType]:
+    """The same with llvm_ad_rgb."""
+    with _variant("llvm_ad_rgb") as module:
+        yield module
+
+
+@pytest.fixture
+def mono_mitsuba() -> Iterator[ModuleType]:
+    """The same with llvm_ad_mono."""
+    with _variant("llvm_ad_mono") as module:
+        yield module

@@ -145,10 +145,9 @@ def test_the_shipped_configurations_are_valid() -> None:
             read_config(path, {})
 
 
+@pytest.mark.usefixtures("mono_mitsuba")
 def test_labels_from_mitsuba_agree(tmp_path: Path) -> None:
     """Rationale: the two tracers share the points and nothing else. Expected: means within four standard errors."""
-    mi = pytest.importorskip("mitsuba")
-    mi.set_variant("llvm_ad_mono")
     config = GenerateConfig(seed=9, train_shards=1, valid_shards=0, points=512, suns=2, walks=32, resolution=(12, 16), size=(3.0, 6.0))
     own, other = tmp_path / "own", tmp_path / "mitsuba"
     generate(config, own)

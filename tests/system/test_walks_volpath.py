@@ -8,7 +8,7 @@ difference of a few per cent; a difference put there on purpose is found.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -34,14 +34,9 @@ ALPHA = 1e-3
 
 
 @pytest.fixture(autouse=True)
-def mi() -> Iterator[Any]:
-    """Mitsuba under the one variant of these tests; whatever was set before is set again."""
-    module = pytest.importorskip("mitsuba")
-    before = module.variant()
-    module.set_variant("llvm_ad_mono")
-    yield module
-    if before is not None:
-        module.set_variant(before)
+def mi(mono_mitsuba: ModuleType) -> ModuleType:
+    """Mitsuba under the one variant of these tests."""
+    return mono_mitsuba
 
 
 def cloud() -> tuple[Volume, float]:

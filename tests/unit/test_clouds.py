@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -282,14 +283,12 @@ def test_a_scene_refuses_impossible_values_and_writes_nothing(tmp_path: Path, ba
     assert not (tmp_path / "scene").exists()
 
 
-def test_the_scene_loads_and_renders_what_beer_and_lambert_say(tmp_path: Path) -> None:
+def test_the_scene_loads_and_renders_what_beer_and_lambert_say(tmp_path: Path, scalar_mitsuba: ModuleType) -> None:
     """Rationale: box, sun, scale and camera of the scene agree with the volume.
 
     Expected behaviour: a camera that looks through an absorbing box at the sky's place sees nothing, and one lit by a constant
     emitter sees the transmittance of the box along its axis.
     """
-    mi = pytest.importorskip("mitsuba")
-    mi.set_variant("scalar_rgb")
     volume = make_cloud("shapes", 0, 16, shape="full_box", height=0.5, depth=0.4)
     scene = write_mitsuba_scene(
         tmp_path, volume, scale=1.5, albedo=0.0, camera_origin=(0.0, 0.0, 50.0), camera_target=(0.0, 0.0, 0.0), fov=1.0
@@ -297,18 +296,16 @@ def test_the_scene_loads_and_renders_what_beer_and_lambert_say(tmp_path: Path) -
     text = scene.read_text()
     start, end = text.index('  <emitter type="directional">'), text.index("</emitter>") + len("</emitter>")
     scene.write_text(text[:start] + '  <emitter type="constant"><rgb name="radiance" value="1"/></emitter>' + text[end:])
-    image = np.array(mi.render(mi.load_file(str(scene), size=8, spp=512), seed=1))
+    image = np.array(scalar_mitsuba.render(scalar_mitsuba.load_file(str(scene), size=8, spp=512), seed=1))
     # The box is 0.8 deep: every ray of this narrow view passes it from face to face; 32,768 binary samples have a deviation of 0.0025.
     assert image.mean() == pytest.approx(np.exp(-1.5 * 0.8), abs=0.012)
     assert read_vol(tmp_path / "density.vol").density.tobytes() == volume.density.tobytes()
 
 
-def test_the_scene_of_a_cloud_renders(tmp_path: Path) -> None:
-    mi = pytest.importorskip("mitsuba")
-    mi.set_variant("scalar_rgb")
+def test_the_scene_of_a_cloud_renders(tmp_path: Path, scalar_mitsuba: ModuleType) -> None:
     volume = make_cloud("cumulus", 0, 24)
     scene = write_mitsuba_scene(tmp_path, volume, scale=scale_for_optical_depth(volume, 20.0), albedo=(0.99, 0.98, 0.97))
-    image = np.array(mi.render(mi.load_file(str(scene), size=8, spp=1)))
+    image = np.array(scalar_mitsuba.render(scalar_mitsuba.load_file(str(scene), size=8, spp=1)))
     assert image.shape == (8, 8, 3)
     assert np.all(np.isfinite(image))
     assert image.max() > 0
