@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,8 +13,6 @@ import numpy as np
 
 from deepclouds.errors import InputError
 from deepclouds.volume import Volume, read_vol
-
-# onnxruntime's names of value types, where they differ from numpy's.
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def _onnx(path: Path) -> list[Section]:
     facts += [(f"output {v.name}", signature(v)) for v in model.graph.output]
     facts += [(f"opset {o.domain or 'ai.onnx'}", str(o.version)) for o in model.opset_import]
     facts += [("nodes", str(len(model.graph.node))), ("weights", str(weights)), ("bytes", str(path.stat().st_size))]
-    facts += sorted((f"metadata {m.key}", m.value) for m in model.metadata_props)
+    facts += [fact for m in sorted(model.metadata_props, key=lambda m: m.key) for fact in _unfolded(f"metadata {m.key}", m.value)]
     return [Section(path.name, facts)]
 
 
@@ -146,7 +145,8 @@ def _exr(path: Path) -> list[Section]:
     from deepclouds.exr import read_exr
 
     image = read_exr(path)
-    sections = [Section(path.name, [(key, str(value)) for key, value in sorted(image.attributes.items())] or [("attributes", "none")])]
+    attributes = [fact for key, value in sorted(image.attributes.items()) for fact in _unfolded(key, str(value))]
+    sections = [Section(path.name, attributes or [("attributes", "none")])]
     for name, pixels in image.channels.items():
         finite = pixels[np.isfinite(pixels)]
         facts = [("size", f"{pixels.shape[1]} x {pixels.shape[0]}")]
@@ -156,6 +156,19 @@ def _exr(path: Path) -> list[Section]:
             facts += [("min", f"{finite.min():.6g}"), ("max", f"{finite.max():.6g}"), ("mean", f"{finite.mean(dtype=np.float64):.6g}")]
         sections.append(Section(f"channel {name}", facts))
     return sections
+
+
+def _unfolded(name: str, text: str) -> list[tuple[str, str]]:
+    """One fact for every entry of a JSON object, and `text` as it stands where it is none."""
+    try:
+        content = json.loads(text)
+    except ValueError:
+        return [(name, text)]
+    if not isinstance(content, dict) or not content:
+        return [(name, text)]
+    return [
+        (f"{name} {key}", f"{v:.6g}" if isinstance(v, float) else v if isinstance(v, str) else json.dumps(v)) for key, v in content.items()
+    ]
 
 
 def _plain(section: Section) -> str:

@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "python -m deepclouds_ru
     parser.add_argument("--spp", type=int, default=16, help="samples a pixel (default %(default)s)")
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with the package)")
     parser.add_argument("--reference", action="store_true", help="also render the scene with Mitsuba's volpath, which takes minutes")
-    parser.add_argument("--reference-spp", type=int, default=16, help="samples a pixel of the reference (default %(default)s)")
+    parser.add_argument("--reference-spp", type=int, default=64, help="samples a pixel of the reference (default %(default)s)")
     parser.add_argument("--multiple", choices=("network", "walks"), default="network", help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
     try:

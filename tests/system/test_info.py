@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 
@@ -95,7 +96,7 @@ def model(tmp_path: Path) -> Path:
         [helper.make_tensor("w", TensorProto.FLOAT, [3, 2], [0.0] * 6)],
     )
     built = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    helper.set_model_props(built, {"licence": "CC0"})
+    helper.set_model_props(built, {"licence": "CC0", "ranges": json.dumps({"g": [-0.3, 0.9], "error": 0.123456789, "note": "none"})})
     path = tmp_path / "model.onnx"
     onnx.save(built, str(path))
     return path
@@ -107,6 +108,9 @@ def test_onnx_signature_and_metadata(capsys: pytest.CaptureFixture[str], model: 
     assert found["input x"] == "float32 [batch, 3]"
     assert found["output y"] == "float32 [batch, 2]"
     assert found["metadata licence"] == "CC0"
+    assert found["metadata ranges g"] == "[-0.3, 0.9]"
+    assert found["metadata ranges error"] == "0.123457"
+    assert found["metadata ranges note"] == "none"
     assert found["bytes"] == str(model.stat().st_size)
     assert found["opset ai.onnx"] == "17"
     assert found["weights"] == "6"
