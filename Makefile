@@ -4,7 +4,6 @@
 PYTHON ?= python3
 SCENES ?=
 TESTS ?=
-MODEL ?= first
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -30,7 +29,7 @@ help:
 	echo "make test            all tests (TESTS='tests/unit -k vdb' for some)"
 	echo "make check           style and types"
 	echo "make bench           run time against error (SCENES=folder for other scenes)"
-	echo "make train-model     make labels, train and export a model (MODEL=$(MODEL)); run again after an interruption, it goes on"
+	echo "make train-model     labels, training and export of the model; run again after an interruption, it goes on"
 	echo "make setup           the installation alone; setup-test, setup-bench, setup-train add their packages"
 	echo "make clean           remove .venv and build"
 
@@ -51,11 +50,16 @@ check: setup-test
 bench: setup-bench
 	$(BIN)/python -m benchmarks.bench $(if $(SCENES),--scenes $(SCENES))
 
+# Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
-	$(BIN)/deepclouds generate configs/$(MODEL)_labels.toml -o work/$(MODEL)
-	if [ -e work/$(MODEL)_run/checkpoint.pt ]; then run=--resume; else run=configs/$(MODEL).toml; fi; \
-	$(BIN)/deepclouds train $$run -o work/$(MODEL)_run
-	$(BIN)/deepclouds export work/$(MODEL)_run -o work/$(MODEL).onnx
+	$(BIN)/deepclouds generate configs/first_labels.toml -o work/first
+	$(BIN)/deepclouds generate configs/first_coarse_labels.toml -o work/first_coarse
+	[ -e work/first_all ] || $(BIN)/deepclouds dataset merge work/first work/first_coarse -o work/first_all
+	for run in first first_finish; do \
+	  if [ -e work/$${run}_run/checkpoint.pt ]; then how=--resume; else how=configs/$$run.toml; fi; \
+	  $(BIN)/deepclouds train $$how -o work/$${run}_run || exit; \
+	done
+	$(BIN)/deepclouds export work/first_finish_run -o work/first.onnx
 
 setup: $(STAMPS)/installed
 setup-test: $(STAMPS)/extra-test

@@ -22,6 +22,8 @@ _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 _UNLIMITED = 0xFFFFFFFF
 # A homogeneous ball becomes a grid of this many voxels a side, each filled by the share of it that lies inside.
 _BALL_VOXELS = 96
+# A homogeneous cube is as exact with one voxel, but the network has learned what edges look like on grids of many.
+_BOX_VOXELS = 32
 # All channels of an image this large take 12 GB.
 _MOST_PIXELS = 1 << 27
 
@@ -348,13 +350,13 @@ def _ball(sphere: Any) -> tuple[NDArray[np.float64], float]:
 
 
 def _homogeneous(container: Any, medium: Any) -> tuple[Volume, float]:
-    """Fill the container's inside with a constant: one voxel for a cube, an antialiased ball for a sphere."""
+    """Fill the container's inside with a constant: a few voxels for a cube, an antialiased ball for a sphere."""
     bounds = container.bbox()
     middle = 0.5 * (np.array(bounds.min, np.float64) + np.array(bounds.max, np.float64))
     sigma_t = float(_coefficients(medium, middle[None])[1][0])
     cube = _container_cube(container)
     if cube is not None:
-        return Volume(np.ones((1, 1, 1), np.float32), cube), sigma_t
+        return Volume(np.ones((_BOX_VOXELS,) * 3, np.float32), cube), sigma_t
     if container.class_name() == "Sphere":
         center, radius = _ball(container)
         n = _BALL_VOXELS

@@ -137,6 +137,23 @@ def test_info_and_stencils(made: Path, capsys: pytest.CaptureFixture[str], tmp_p
         assert np.isfinite(stored["stencil"]).all()
 
 
+def test_merged_sets_hold_the_shards_of_both(made: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    other, joined = tmp_path / "other", tmp_path / "joined"
+    generate(SMALL.model_copy(update={"seed": 8, "valid_shards": 0, "train_shards": 1}), other)
+    assert main(["dataset", "merge", str(made), str(other), "-o", str(joined)]) == 0
+    a, b, both = open_dataset(made), open_dataset(other), open_dataset(joined)
+    assert [s.sha256 for s in both.shards] == [s.sha256 for s in (*a.shards, *b.shards)]
+    assert [s.index for s in both.shards] == [0, 1, 2, 3]
+    assert main(["dataset", "verify", str(joined)]) == 0
+    assert main(["dataset", "merge", str(made), "-o", str(joined)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    swapped = SMALL.model_copy(update={"families": ("plume",), "held_out": ("shapes",), "valid_shards": 0, "train_shards": 1})
+    generate(swapped, tmp_path / "swapped")
+    assert main(["dataset", "merge", str(made), str(tmp_path / "swapped"), "-o", str(tmp_path / "mixed")]) == 2
+    assert "held out in another" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*mixed*"))
+
+
 def test_the_shipped_configurations_are_valid() -> None:
     for path in sorted(Path(__file__).parents[2].glob("configs/*.toml")):
         if path.stem.endswith("_labels"):

@@ -111,6 +111,23 @@ def test_a_run_says_everything_about_itself(small_dataset: Path, tmp_path: Path)
     assert state["step"] == 3
 
 
+def test_a_run_can_set_out_from_the_averaged_weights_of_another(small_dataset: Path, tmp_path: Path) -> None:
+    first = trainer(tmp_path / "first", settings(small_dataset))
+    assert first.train(lambda: False)
+    expected = first.average.averaged(first.network).state_dict()
+    second = trainer(tmp_path / "second", settings(small_dataset, start=str(tmp_path / "first"), seed=5))
+    assert all(torch.equal(value, second.network.state_dict()[name]) for name, value in expected.items())
+    assert second.step == 0
+    before = second.network.level_mean.clone()
+    assert second.train(after(1, second)) is False
+    # The standardisation belongs to the weights: it is not fitted again.
+    assert torch.equal(before, second.network.level_mean)
+    with pytest.raises(InputError, match="its network is another"):
+        trainer(tmp_path / "third", settings(small_dataset, start=str(tmp_path / "first"), network={"width": 16}))
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        trainer(tmp_path / "fourth", settings(small_dataset, start=str(tmp_path / "nothing")))
+
+
 def test_sigterm_saves_and_exits_130(small_dataset: Path, tmp_path: Path, root: Path) -> None:
     config = tmp_path / "run.toml"
     config.write_text(f'data = "{small_dataset}"\nsteps = 1000000\nbatch = 16\n[network]\nwidth = 8\n[samples]\nshards = 2\nqueries = 16\n')

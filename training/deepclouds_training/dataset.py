@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
+import shutil
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from deepclouds.errors import InputError
 from deepclouds.replacing import replacing
-from deepclouds_training.shards import Dataset, open_dataset, read_shard
+from deepclouds_training.shards import Dataset, ShardInfo, open_dataset, read_shard, shard_file, write_manifest
 
 
 def main(argv: Sequence[str], prog: str) -> int:
-    """Run `deepclouds dataset info|verify|export-stencils`."""
+    """Run `deepclouds dataset info|verify|merge|export-stencils`."""
     parser = argparse.ArgumentParser(prog=prog, description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     info = verbs.add_parser("info", help="counts, ranges and noise of the labels")
     info.add_argument("folder", type=Path)
+    merge = verbs.add_parser("merge", help="join data sets into one")
+    merge.add_argument("folders", type=Path, nargs="+", help="data sets with the same schema and tracer")
+    merge.add_argument("-o", "--output", type=Path, required=True, help="folder of the joined data set; must not exist")
     verify = verbs.add_parser("verify", help="check every shard against the hash in the manifest")
     verify.add_argument("folder", type=Path)
     export = verbs.add_parser("export-stencils", help="write stencils, inputs and labels as one .npz file")
@@ -31,6 +37,9 @@ def main(argv: Sequence[str], prog: str) -> int:
     export.add_argument("--shards", type=int, help="at most so many shards, evenly chosen (default all)")
     export.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args(argv)
+    if arguments.verb == "merge":
+        _merge([open_dataset(folder) for folder in arguments.folders], arguments.output)
+        return 0
     dataset = open_dataset(arguments.folder)
     if arguments.verb == "info":
         _info(dataset)
@@ -67,6 +76,39 @@ def _info(dataset: Dataset) -> None:
         values = np.concatenate(parts) if parts else np.zeros(1)
         low, five, middle, ninety_five, high = np.percentile(values, (0, 5, 50, 95, 100))
         print(f"  {name:16s}{low:10.4g}{five:10.4g}{middle:10.4g}{values.mean():10.4g}{ninety_five:10.4g}{high:12.4g}")
+
+
+def _merge(datasets: list[Dataset], output: Path) -> None:
+    tracers = sorted({str(d.manifest.get("tracer")) for d in datasets})
+    if len(tracers) > 1:
+        raise InputError(f"the data sets come from different tracers ({', '.join(tracers)}): merge those of one")
+    held_out = {s.family for d in datasets for s in d.shards if s.split == "valid"}
+    both = held_out & {s.family for d in datasets for s in d.shards if s.split == "train"}
+    if both:
+        raise InputError(f"families {sorted(both)} are trained on in one data set and held out in another: they cannot be joined")
+    if output.exists():
+        raise InputError(f"{output}: exists already; name a new folder")
+    # Made under another name and renamed, so that an interrupted merge leaves nothing that looks like a data set.
+    partial = output.with_name(f".{output.name}.{os.getpid()}.tmp")
+    partial.mkdir(parents=True)
+    try:
+        shards: dict[int, ShardInfo] = {}
+        for dataset in datasets:
+            for entry in dataset.shards:
+                index = len(shards)
+                target = partial / shard_file(index)
+                # The bytes are the same: a second name costs no disk where both folders share one.
+                try:
+                    os.link(dataset.folder / entry.file, target)
+                except OSError:
+                    shutil.copyfile(dataset.folder / entry.file, target)
+                shards[index] = replace(entry, index=index, file=target.name)
+        sources = [{"config": d.manifest.get("config"), "config_hash": d.manifest.get("config_hash"), "hash": d.hash} for d in datasets]
+        write_manifest(partial, {"merged": sources, "tracer": tracers[0], "total_shards": len(shards)}, shards)
+        partial.rename(output)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    print(f"{output}: {len(shards)} shards of {len(datasets)} data sets")
 
 
 def _verify(dataset: Dataset) -> int:

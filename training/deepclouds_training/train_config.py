@@ -21,6 +21,8 @@ class TrainConfig(BaseModel):
     ----------
     data
         folder of the data set.
+    start
+        folder of a finished run of the same network, from whose averaged weights this one sets out; None starts afresh.
     seed
         root of all random streams.
     steps
@@ -48,6 +50,7 @@ class TrainConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     data: str
+    start: str | None = None
     seed: int = 0
     steps: int = Field(default=20000, ge=1)
     minutes: float | None = Field(default=None, gt=0)

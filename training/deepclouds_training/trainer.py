@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,23 @@ class Trainer:
         self.ranges: dict[str, tuple[float, float]] = {}
         pool = config.samples.shards * config.samples.queries
         self.batches = pool // config.batch
+        self.fresh = config.start is None
         self.resumed = self._restore()
+        if not self.resumed and config.start is not None:
+            self._set_out_from(config.start)
+
+    def _set_out_from(self, folder: str) -> None:
+        run = RunFolder(Path(folder))
+        state = run.load_checkpoint()
+        if state is None:
+            raise InputError(f"start = '{folder}': holds no checkpoint; name the folder of a run")
+        if run.config().network != self.config.network:
+            raise InputError(f"start = '{folder}': its network is another one; give this run the same [network] table")
+        self.network.load_state_dict(state["network"])
+        average = WeightAverage(self.network, run.config().ema)
+        average.load_state_dict(state["average"])
+        self.network.load_state_dict(average.averaged(self.network).state_dict())
+        self.ranges = {name: (low, high) for name, (low, high) in state["ranges"].items()}
 
     def _restore(self) -> bool:
         state = self.run.load_checkpoint()
@@ -141,7 +158,7 @@ class Trainer:
         return True
 
     def _see(self, pool: Samples, number: int) -> None:
-        if self.step == 0:
+        if self.step == 0 and self.fresh:
             self.network.fit_inputs(pool.stencil, pool.label)
         for name, (low, high) in pool.ranges().items():
             before = self.ranges.get(name, (low, high))
