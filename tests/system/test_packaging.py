@@ -92,7 +92,9 @@ def test_the_native_module_exports_its_init_function_alone() -> None:
 def wheel(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel built from the checkout, with every intermediate file outside it."""
     folder = tmp_path_factory.mktemp("wheel")
-    options = ["--no-build-isolation", "--no-deps", "--no-index", "--wheel-dir", str(folder), "-C", f"build-dir={folder / 'build'}"]
+    # The long option, since Debian 12's pip does not know -C.
+    build = f"--config-settings=build-dir={folder / 'build'}"
+    options = ["--no-build-isolation", "--no-deps", "--no-index", "--wheel-dir", str(folder), build]
     done = subprocess.run(
         [sys.executable, "-m", "pip", "wheel", *options, str(root)], capture_output=True, text=True, check=False, timeout=900
     )
