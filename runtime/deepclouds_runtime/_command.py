@@ -61,7 +61,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("input", metavar="INPUT", help="scene.xml, cloud.vdb or cloud.vol")
     parser.add_argument("-o", "--output", metavar="OUT.exr", type=Path, required=True, help="image to write")
-    parser.add_argument("--spp", type=_positive, help="samples a pixel (default: the scene's; 32 for a volume)")
+    parser.add_argument("--spp", type=_positive, help="samples a pixel (default: the scene's; 12 for a volume)")
     parser.add_argument("--seed", type=_seed, default=0, help="of all random numbers (default %(default)s)")
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with deepclouds)")
     parser.add_argument(

@@ -73,7 +73,7 @@ class VolumeOptions:
     up: str = "y"
     view: tuple[float, float] = (0.0, 5.0)
     size: tuple[int, int] = (640, 480)
-    spp: int = 32
+    spp: int = 12
     hide_emitters: bool = False
     max_depth: int = -1
 
