@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
@@ -37,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"deepclouds: unknown command '{name}'; there are: {', '.join(sorted(commands))}", file=sys.stderr)
         return 2
     try:
-        return int(commands[name].load()(arguments[1:], f"deepclouds {name}"))
+        code = int(commands[name].load()(arguments[1:], f"deepclouds {name}"))
+        sys.stdout.flush()
+        return code
     except InputError as error:
         if debug:
             raise
@@ -48,6 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"deepclouds {name}: the Python package '{error.name}' is missing; install the extra that brings it", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        # The reader, such as `head`, has seen enough. Nothing more may be written, not even by the interpreter's last flush.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         print(f"deepclouds {name}: interrupted", file=sys.stderr)
         return 130

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -147,3 +149,15 @@ def test_a_terminal_gets_tables(
     assert "[red]fog[/red]" in out
     assert "voxel size" in out
     assert "│" in out
+
+
+def test_a_reader_that_has_seen_enough_ends_it_quietly(model: Path) -> None:
+    """Rationale: `deepclouds info ... | head -1` is ordinary use."""
+    code = "import sys; from deepclouds.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", code, "info", str(model)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    with process.stderr as stream:
+        assert stream.read() == b""
+    assert process.wait() == 0
