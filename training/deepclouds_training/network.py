@@ -219,6 +219,10 @@ class Network(nn.Module):
 
     def forward(self, stencil: Tensor, aux: Tensor) -> Tensor:
         """Predict j (n,) from `stencil` (n, 10, 225) and `aux` (n, 6)."""
+        return self.leave(self.hidden(stencil, aux))
+
+    def hidden(self, stencil: Tensor, aux: Tensor) -> Tensor:
+        """All layers but the last, (n, width): what training may compute in half precision."""
         levels = torch.unbind(stencil, dim=1)
         f = self.angle(aux)
         o: Tensor | None = None
@@ -229,8 +233,12 @@ class Network(nn.Module):
             weight, bias = plain if self.is_folded else block.standardised(self.level_mean[k], self.level_scale[k])
             o = block(self.compressed(levels[k], k), weight, bias, f, o)
         assert o is not None
-        hidden: Tensor = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
-        hidden = F.relu(self.fc_2(torch.cat([hidden, f], dim=1)))
+        h: Tensor = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
+        h = F.relu(self.fc_2(torch.cat([h, f], dim=1)))
+        return h
+
+    def leave(self, hidden: Tensor) -> Tensor:
+        """The last layer: j (n,), an exponential, whose argument needs all digits."""
         return torch.exp(torch.clamp(self.head(hidden).squeeze(1), LOWEST, HIGHEST))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -37,6 +37,8 @@ class TrainConfig(BaseModel):
         decay of the weights' running mean.
     power
         exponent of the loss's weight.
+    precision
+        arithmetic of the hidden layers' products in training; weights, loss, averages and validation are float32 either way.
     network, samples
         the network's shape and the samples' selection.
     valid_shards, valid_queries, valid_every
@@ -60,6 +62,7 @@ class TrainConfig(BaseModel):
     warmup: int = Field(default=200, ge=0)
     ema: float = Field(default=0.999, ge=0, lt=1)
     power: float = Field(default=1.5, ge=0, le=2)
+    precision: Literal["float32", "bfloat16"] = "float32"
     network: NetworkConfig = NetworkConfig()
     samples: SampleConfig = SampleConfig()
     valid_shards: int = Field(default=48, ge=1)

@@ -168,7 +168,9 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate()
         stencil, aux, label = (torch.from_numpy(v[rows]) for v in (pool.stencil, pool.aux, pool.label))
-        loss = relative_squared_error(self.network(stencil, aux), label, self.config.power)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+            hidden = self.network.hidden(stencil, aux)
+        loss = relative_squared_error(self.network.leave(hidden.float()), label, self.config.power)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise InputError(
