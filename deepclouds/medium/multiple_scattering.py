@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.medium.field import Field
-from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
+from deepclouds.medium.phase import as_lobes, hg, rotate_to, sample_hg_cosine, sample_two_lobe_cosine, two_lobe
 
 
 def trace_walks(
     field: Field,
     points: NDArray[np.float32],
     directions: NDArray[np.float32],
-    g: NDArray[np.float32],
+    phase: NDArray[np.float32],
     suns: NDArray[np.float32],
     albedos: NDArray[np.float32],
     walks: int,
@@ -42,8 +42,8 @@ def trace_walks(
         (n, 3) world points, inside or outside of the box.
     directions
         (n, 3) unit vectors w, the camera ray's travel.
-    g
-        (n,) Henyey-Greenstein parameters, -1 < g < 1.
+    phase
+        (n, 3) lobes (g1, g2, weight) of `deepclouds.medium.phase.two_lobe`, or (n,) parameters g of single lobes.
     suns
         (n, k, 3) unit vectors TOWARD the suns that every walk of a point is connected to.
     albedos
@@ -75,7 +75,7 @@ def trace_walks(
     if total * k_suns * m_albedos >= 2**31:
         raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
     types = field.types
-    queries = _Queries(types, points, directions, g, suns, albedos)
+    queries = _Queries(types, points, directions, as_lobes(phase), suns, albedos)
     result = dr.zeros(types.Float, total * k_suns * m_albedos)
     counter = dr.zeros(types.UInt32, 1)
     key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
@@ -87,16 +87,17 @@ def trace_walks(
 class _Queries:
     """The arrays a walk starts from, on the device."""
 
-    def __init__(self, types: Any, points: Any, directions: Any, g: Any, suns: Any, albedos: Any) -> None:
+    def __init__(self, types: Any, points: Any, directions: Any, lobes: Any, suns: Any, albedos: Any) -> None:
         def upload(values: Any) -> Any:
             return types.Float(np.ascontiguousarray(values, np.float32))
 
         self.points = [upload(points[:, c]) for c in range(3)]
         self.directions = [upload(directions[:, c]) for c in range(3)]
-        self.g = upload(g)
+        # A second lobe doubles the cost of a connection: it is left out, with the same result, where no point has one.
+        self.lobes = [upload(lobes[:, c]) for c in range(1 if np.all(lobes[:, 2] == 1) else 3)]
         self.suns = [[upload(suns[:, k, c]) for c in range(3)] for k in range(suns.shape[1])]
         self.albedos = [upload(albedos[:, m]) for m in range(albedos.shape[1])]
-        dr.eval(self.points, self.directions, self.g, self.suns, self.albedos)
+        dr.eval(self.points, self.directions, self.lobes, self.suns, self.albedos)
 
 
 def _uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any]:
@@ -118,6 +119,14 @@ def _stream(types: Any, key: Any, number: Any) -> list[Any]:
     return [types.UInt32(z & 0xFFFFFFFF) | 1, types.UInt32(z >> 32)]
 
 
+def _phase(lobes: list[Any], cos_theta: Any) -> Any:
+    return hg(cos_theta, *lobes) if len(lobes) == 1 else two_lobe(cos_theta, *lobes)
+
+
+def _sample_cosine(lobes: list[Any], u: Any) -> Any:
+    return sample_hg_cosine(u, *lobes) if len(lobes) == 1 else sample_two_lobe_cosine(u, *lobes)
+
+
 @dr.syntax
 def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, counter: Any, result: Any, lanes: int, connect: float) -> None:
     types = field.types
@@ -137,7 +146,7 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
     position = dr.zeros(Array3f, lanes)  # of the last collision, in the unit cube of the box
     direction = dr.zeros(Array3f, lanes)  # of the walk, world
     distance = dr.zeros(Float, lanes)  # along the current segment, world units
-    g = dr.zeros(Float, lanes)
+    lobes = [dr.zeros(Float, lanes) for _ in queries.lobes]
     pending = dr.zeros(UInt32, lanes)  # bit k: the connection to sun k is still to be traced
     suns = [dr.zeros(Array3f, lanes) for _ in range(k_suns)]
     albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
@@ -155,11 +164,12 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
             alive = number < limit
             point = number // walks_each
             rng = _stream(types, key, number)
-            g = dr.gather(Float, queries.g, point, alive)
+            for i in range(len(lobes)):
+                lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
             rng, u_cosine = _uniform(types, rng)
             rng, u_azimuth = _uniform(types, rng)
             incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
-            direction = rotate_to(incoming, sample_hg_cosine(u_cosine, g), 2 * np.pi * u_azimuth)
+            direction = rotate_to(incoming, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
             origin = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.points))
             enter, leave = field.intersect(origin, direction)
             position = field.to_unit(origin)
@@ -190,7 +200,7 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
 
         collision = hit & ~shadow
         connected = shadow & ~inside
-        value = dr.select(connected, dr.maximum(4 * np.pi * hg(dr.dot(direction, sun), g), least), 0)
+        value = dr.select(connected, dr.maximum(4 * np.pi * _phase(lobes, dr.dot(direction, sun)), least), 0)
         for k in range(k_suns):
             mine = connected & (lowest == (1 << k))
             for m in range(m_albedos):
@@ -203,7 +213,7 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         for k in range(k_suns):
             u_k = u_connect + 0.6180339887 * k
             u_k = u_k - dr.floor(u_k)
-            chosen |= dr.select(u_k < connect_4pi * hg(dr.dot(direction, suns[k]), g), UInt32(1 << k), UInt32(0))
+            chosen |= dr.select(u_k < connect_4pi * _phase(lobes, dr.dot(direction, suns[k])), UInt32(1 << k), UInt32(0))
         pending = dr.select(collision, chosen, pending)
         position = dr.select(collision, unit, position)
         distance = dr.select(collision | connected | (shadow & hit), 0, distance)
@@ -211,7 +221,7 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         turn = (pending == 0) & (collision | (shadow & (connected | hit)))
         rng, u_cosine = _uniform(types, rng)
         rng, u_azimuth = _uniform(types, rng)
-        direction = dr.select(turn, rotate_to(direction, sample_hg_cosine(u_cosine, g), 2 * np.pi * u_azimuth), direction)
+        direction = dr.select(turn, rotate_to(direction, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth), direction)
         for m in range(m_albedos):
             weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
         ended = alive & ~inside & ~shadow

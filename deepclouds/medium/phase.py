@@ -1,7 +1,8 @@
-"""Henyey-Greenstein phase function: value, logarithm and sampling, for Dr.Jit arrays and NumPy alike.
+"""Phase functions of one and of two Henyey-Greenstein lobes: value and sampling, for Dr.Jit arrays and NumPy alike.
 
 Convention: ``cos_theta`` is the cosine between the directions of travel before and after the scattering, so ``g > 0`` is bright
-looking into the sun; `phase` integrates to 1 over the sphere (Henyey and Greenstein 1941).
+looking into the sun; every phase function integrates to 1 over the sphere (Henyey and Greenstein 1941; two lobes: Kattawar 1975).
+As an array a phase function is a row (g1, g2, weight), ``weight * HG(g1) + (1 - weight) * HG(g2)``; a single lobe is (g, 0, 1).
 """
 
 from __future__ import annotations
@@ -40,6 +41,47 @@ def sample_hg_cosine(u: Any, g: Any) -> Any:
     ratio = (1 - safe * safe) / (1 - safe + 2 * safe * u)
     cosine = (1 + safe * safe - ratio * ratio) / (2 * safe)
     return dr.clip(dr.select(small, 1 - 2 * u, cosine), -1, 1)
+
+
+def two_lobe(cos_theta: Any, g1: Any, g2: Any, weight: Any) -> Any:
+    """Phase function value, 1/sr, of ``weight * HG(g1) + (1 - weight) * HG(g2)``; all Dr.Jit arrays, 0 <= weight <= 1."""
+    return weight * hg(cos_theta, g1) + (1 - weight) * hg(cos_theta, g2)
+
+
+def two_lobe_numpy(cos_theta: ArrayLike, g1: ArrayLike, g2: ArrayLike, weight: ArrayLike) -> NDArray[np.float64]:
+    """The readable twin of `two_lobe` in float64."""
+    weight = np.asarray(weight, np.float64)
+    value: NDArray[np.float64] = weight * hg_numpy(cos_theta, g1) + (1 - weight) * hg_numpy(cos_theta, g2)
+    return value
+
+
+def sample_two_lobe_cosine(u: Any, g1: Any, g2: Any, weight: Any) -> Any:
+    """Cosine of the scattering angle of `two_lobe`, from `u` in [0, 1): u chooses the lobe and, stretched, the angle in it."""
+    import drjit as dr
+
+    first = u < weight
+    # The guard keeps the lobe that is never chosen from a division by zero.
+    share = dr.maximum(dr.select(first, weight, 1 - weight), 1e-12)
+    stretched = dr.minimum(dr.select(first, u, u - weight) / share, 1)
+    return sample_hg_cosine(stretched, dr.select(first, g1, g2))
+
+
+def as_lobes(phase: ArrayLike) -> NDArray[np.float32]:
+    """Phase functions as rows (g1, g2, weight), float32 (n, 3), from (n, 3) rows or from (n,) single lobes g.
+
+    Raises
+    ------
+    ValueError
+        for another shape, a |g| of 1 or more, or a weight outside of [0, 1].
+    """
+    rows = np.asarray(phase, np.float32)
+    if rows.ndim == 1:
+        rows = np.stack([rows, np.zeros_like(rows), np.ones_like(rows)], axis=1)
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise ValueError(f"a phase function is g or (g1, g2, weight), got an array of shape {np.shape(phase)}")
+    if not (np.all(np.abs(rows[:, :2]) < 1) and np.all((rows[:, 2] >= 0) & (rows[:, 2] <= 1))):
+        raise ValueError("a phase function needs -1 < g1, g2 < 1 and a weight from 0 to 1")
+    return rows
 
 
 def rotate_to(direction: Any, cosine: Any, azimuth: Any) -> Any:

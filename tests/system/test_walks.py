@@ -16,11 +16,14 @@ from deepclouds.backend import backend
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
 from deepclouds.medium.optical_depth import optical_depth
-from deepclouds.medium.phase import hg_numpy, sample_hg_cosine
+from deepclouds.medium.phase import as_lobes, sample_two_lobe_cosine, two_lobe_numpy
 from deepclouds.volume import Volume
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+# A single lobe g, or the lobes (g1, g2, weight).
+Phase = float | tuple[float, float, float]
+TWO_LOBES = (0.9, -0.4, 0.75)
 
 
 def rotation(seed: int) -> Floats:
@@ -56,15 +59,20 @@ def inside(field: Field, count: int, seed: int, margin: float = 0.0) -> Singles:
     return points
 
 
+def lobes(phase: Phase, count: int = 1) -> Singles:
+    """The phase function in `count` rows, (count, 3)."""
+    return np.repeat(as_lobes(np.array([phase])), count, axis=0)
+
+
 def trace(
-    field: Field, points: Singles, w: Singles, g: float, suns: Singles, albedos: list[float], walks: int, seed: int, **more: float
+    field: Field, points: Singles, w: Singles, phase: Phase, suns: Singles, albedos: list[float], walks: int, seed: int, **more: float
 ) -> Singles:
-    """`trace_walks` with one g and one list of albedos; suns (n, k, 3) or (k, 3)."""
+    """`trace_walks` with one phase function and one list of albedos; suns (n, k, 3) or (k, 3)."""
     n = len(points)
     suns = np.broadcast_to(suns, (n, *suns.shape[-2:]))
     lanes = int(more.pop("lanes", 4096))
     columns = np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos)))
-    return trace_walks(field, points, w, np.full(n, g, np.float32), suns, columns, walks, seed, lanes=lanes, **more)
+    return trace_walks(field, points, w, lobes(phase, n), suns, columns, walks, seed, lanes=lanes, **more)
 
 
 def exit_distance(o: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -74,12 +82,13 @@ def exit_distance(o: Floats, d: Floats) -> tuple[Floats, Floats]:
     return np.maximum(np.minimum(t0, t1).max(axis=-1), 0), np.maximum(t0, t1).min(axis=-1)
 
 
-def first_order(sigma: float, x: Floats, w: Floats, sun: Floats, g: float) -> float:
+def first_order(sigma: float, x: Floats, w: Floats, sun: Floats, phase: Phase) -> float:
     """4 pi J / (albedo^2 E) of the first order alone in a homogeneous unit cube, by quadrature over w' and the distance along it."""
     nodes, weights = np.polynomial.legendre.leggauss(48)
-    # Directions drawn evenly from the lobe around w by its inverse distribution, so that only smooth factors are integrated.
+    # Directions drawn evenly from the phase function around w by its inverse distribution: only smooth factors are integrated.
     u = (np.arange(160) + 0.5) / 160
-    cosine = np.array(sample_hg_cosine(backend().Float(u), backend().Float(g)), np.float64)
+    parameters = [float(v) for v in lobes(phase)[0]]
+    cosine = np.array(sample_two_lobe_cosine(backend().Float(u), *parameters), np.float64)
     azimuth = 2 * np.pi * (np.arange(160) + 0.5) / 160
     a = np.cross(w, np.eye(3)[np.argmin(np.abs(w))])
     a /= np.linalg.norm(a)
@@ -94,28 +103,28 @@ def first_order(sigma: float, x: Floats, w: Floats, sun: Floats, g: float) -> fl
     at = x + t[..., None] * d[:, None]
     _, toward = exit_distance(at, np.broadcast_to(sun, at.shape))
     along = np.sum(np.exp(-sigma * (t - enter[:, None] + toward)) * weights, axis=1) * length / 2 * sigma
-    return float(np.sum(4 * np.pi * hg_numpy(d @ sun, g) * along)) / met.size
+    return float(np.sum(4 * np.pi * two_lobe_numpy(d @ sun, *parameters) * along)) / met.size
 
 
-@pytest.mark.parametrize("g", [-0.4, 0.0, 0.6, 0.85])
-def test_first_order_in_a_homogeneous_cube(g: float) -> None:
+@pytest.mark.parametrize("phase", [-0.4, 0.0, 0.85, TWO_LOBES])
+def test_first_order_in_a_homogeneous_cube(phase: Phase) -> None:
     """At albedo 0 the label is the first order alone; the points lie inside, at a face and outside of the cube."""
     x = np.array([[0.5, 0.5, 0.5], [0.1, 0.9, 0.3], [0.999, 0.4, 0.6], [-0.6, 0.5, 0.4]])
     w = np.array([sphere(1, 3)[0], [0, 0, -1], sphere(1, 4)[0], [1, 0.1, 0.05]], np.float64)
     w /= np.linalg.norm(w, axis=1, keepdims=True)
     suns = sphere(2, 5)
     walks = 1_000_000
-    j = trace(cube(3.0), x.astype(np.float32), w.astype(np.float32), g, suns, [0.0], walks, seed=6)[..., 0].astype(np.float64)
+    j = trace(cube(3.0), x.astype(np.float32), w.astype(np.float32), phase, suns, [0.0], walks, seed=6)[..., 0].astype(np.float64)
     mean, error = j.mean(axis=1), j.std(axis=1) / np.sqrt(walks)
-    expected = np.array([[first_order(3.0, x[i], w[i], s, g) for s in suns.astype(np.float64)] for i in range(4)])
+    expected = np.array([[first_order(3.0, x[i], w[i], s, phase) for s in suns.astype(np.float64)] for i in range(4)])
     assert np.all(error / expected < 0.03)
     assert np.median(error / expected) < 0.015
     assert np.abs((mean - expected) / error).max() < 4
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5, 0.85])
+@pytest.mark.parametrize("phase", [0.0, 0.85, TWO_LOBES])
 @pytest.mark.parametrize("make", [cube, cloud])
-def test_white_furnace(make: type, g: float) -> None:
+def test_white_furnace(make: type, phase: Phase) -> None:
     """At albedo 1 the mean over all suns of 4 pi p T + j is exactly 1, at every point and in every direction."""
     field: Field = make()
     n, k, walks = 48, 8, 220
@@ -127,13 +136,14 @@ def test_white_furnace(make: type, g: float) -> None:
     repeats = 40
     rows = np.repeat(np.arange(n), repeats)
     suns = np.stack([even @ rotation(1000 + i).T for i in range(n * repeats)]).astype(np.float32)
-    j = trace(field, points[rows], w[rows], g, suns, [1.0], walks, seed=9)
+    j = trace(field, points[rows], w[rows], phase, suns, [1.0], walks, seed=9)
     multiple = j.mean(axis=(1, 2, 3)).reshape(n, repeats).astype(np.float64)
 
     # The mean of 4 pi p T over suns is that of T over suns drawn from p around w.
     t, draws = field.types, 4000
     rng = np.random.default_rng(10)
-    cosine = np.array(sample_hg_cosine(t.Float(rng.random(n * draws)), t.Float(g)), np.float64)
+    parameters = [t.Float(float(v)) for v in lobes(phase)[0]]
+    cosine = np.array(sample_two_lobe_cosine(t.Float(rng.random(n * draws)), *parameters), np.float64)
     azimuth = rng.uniform(0, 2 * np.pi, n * draws)
     w64 = w.astype(np.float64)
     a = np.cross(w64, np.eye(3)[np.argmin(np.abs(w64), axis=1)])
@@ -202,6 +212,25 @@ def test_roulette_of_the_connections_keeps_the_mean() -> None:
         assert abs(difference.sum()) < 4 * np.sqrt(variance.sum())
         z = difference / np.sqrt(variance)
         assert np.abs(z).max() < stats.norm.isf(1e-3 / 2 / z.size)
+
+
+def test_lobes_of_one_kind_are_one_lobe() -> None:
+    """A second lobe that is never chosen changes nothing; the lobes' order changes no mean; one lobe cut in two is that lobe."""
+    field = cloud()
+    points, w, suns, walks = inside(field, 60, 52), sphere(60, 53), sphere(1, 54), 8000
+    single = trace(field, points, w, 0.7, suns, [1.0], walks, seed=55)
+    # One other row with two lobes makes the walks evaluate both lobes everywhere.
+    mixed = np.concatenate([lobes(0.7, 60), lobes(TWO_LOBES)])
+    more = [np.concatenate([v, v[:1]]) for v in (points, w)]
+    both = trace_walks(field, *more, mixed, np.broadcast_to(suns, (61, 1, 3)), np.ones((61, 1), np.float32), walks, seed=55)
+    np.testing.assert_allclose(both[:60], single, rtol=1e-5)
+    for first, second in (((0.7, 0.7, 0.3), 0.7), ((0.9, -0.4, 0.75), (-0.4, 0.9, 0.25))):
+        sets = [trace(field, points, w, p, suns, [1.0], walks, seed=s)[..., 0].astype(np.float64) for p, s in ((first, 56), (second, 57))]
+        difference = sets[0].mean(axis=1) - sets[1].mean(axis=1)
+        variance = sum(v.var(axis=1) / walks for v in sets)
+        assert np.sqrt(np.sum(variance)) < 0.02 * sets[1].mean(axis=1).sum()
+        assert abs(difference.sum()) < 4 * np.sqrt(np.sum(variance))
+        assert np.abs(difference / np.sqrt(variance)).max() < stats.norm.isf(1e-3 / 2 / difference.size)
 
 
 def test_lanes_change_nothing() -> None:

@@ -1,4 +1,4 @@
-"""Henyey-Greenstein: normalisation, sampling by chi-square (and the power of that test), and the rotation around a direction."""
+"""Phase functions: normalisation, sampling by chi-square (and the power of that test), and the rotation around a direction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 from scipy import integrate, stats
 
 from deepclouds.backend import backend
-from deepclouds.medium.phase import hg, hg_numpy, rotate_to, sample_hg_cosine
+from deepclouds.medium.phase import (
+    as_lobes,
+    hg,
+    hg_numpy,
+    rotate_to,
+    sample_hg_cosine,
+    sample_two_lobe_cosine,
+    two_lobe,
+    two_lobe_numpy,
+)
 
 Floats = NDArray[np.float64]
 ASYMMETRIES = [-0.99, -0.85, -0.3, 0.0, 0.002, 0.2, 0.6, 0.85, 0.95, 0.99]
@@ -21,12 +30,12 @@ def cosines(g: float, count: int, seed: int) -> Floats:
     return np.array(sample_hg_cosine(t.Float(u), t.Float(g)), np.float64)
 
 
-def chi_square(samples: Floats, g: float, bins: int = 48) -> float:
-    """p-value of "the cosines follow HG with this g"; bins of equal probability, by quadrature of the density alone."""
-    # Nodes crowd where the density peaks: 1 - |cos| runs over ten decades.
-    gap = np.concatenate([[0.0], np.geomspace(1e-7, 2, 20001)])
-    c = (1 - gap)[::-1] if g >= 0 else gap - 1
-    density = 2 * np.pi * hg_numpy(c, g)
+def chi_square(samples: Floats, g1: float, g2: float = 0.0, weight: float = 1.0, bins: int = 48) -> float:
+    """p-value of "the cosines follow these lobes"; bins of equal probability, by quadrature of the density alone."""
+    # Nodes crowd where the density peaks, at both ends: 1 - |cos| runs over seven decades.
+    gap = np.concatenate([[0.0], np.geomspace(1e-7, 1, 20001)])
+    c = np.concatenate([gap - 1, 1 - gap[-2::-1]])
+    density = 2 * np.pi * two_lobe_numpy(c, g1, g2, weight)
     cumulative = np.concatenate([[0.0], np.cumsum(np.diff(c) * (density[1:] + density[:-1]) / 2)])
     assert cumulative[-1] == pytest.approx(1, abs=1e-5)
     edges = np.interp(np.arange(1, bins) / bins, cumulative / cumulative[-1], c)
@@ -78,6 +87,58 @@ def test_nearly_isotropic_lobes_stay_within_a_thousandth() -> None:
     for g in (-9e-4, 1e-5, 9e-4):
         samples = cosines(g, 1_000_000, seed=13)
         assert abs(samples.mean() - g) < 1e-3 + 4 * samples.std() / 1000
+
+
+# The second is nearly that of cloud droplets: a forward peak and a weak backward lobe.
+LOBES = [(0.85, -0.5, 0.8), (0.95, -0.3, 0.97), (0.99, -0.99, 0.5), (0.0, 0.9, 0.25), (0.6, 0.7, 0.0), (-0.4, 0.2, 1.0)]
+
+
+def lobe_cosines(lobes: tuple[float, float, float], count: int, seed: int) -> Floats:
+    t = backend()
+    u = np.random.default_rng(seed).random(count, dtype=np.float32)
+    return np.array(sample_two_lobe_cosine(t.Float(u), *(t.Float(v) for v in lobes)), np.float64)
+
+
+@pytest.mark.parametrize("lobes", LOBES)
+def test_two_lobes_equal_their_twin_integrate_to_one_and_have_their_mean(lobes: tuple[float, float, float]) -> None:
+    g1, g2, weight = (float(np.float32(v)) for v in lobes)
+    for power, expected in ((0, 1.0), (1, weight * g1 + (1 - weight) * g2), (2, None)):
+        moment, _ = integrate.quad(
+            lambda c, n=power: 2 * np.pi * c**n * float(two_lobe_numpy(c, g1, g2, weight)), -1, 1, points=[-0.999, 0.999], limit=400
+        )
+        # The second Legendre moment of HG is g^2.
+        second = (1 + 2 * (weight * g1**2 + (1 - weight) * g2**2)) / 3
+        assert moment == pytest.approx(second if expected is None else expected, abs=1e-7)
+    t = backend()
+    c = np.concatenate([np.linspace(-1, 1, 2001), 1 - np.geomspace(1e-7, 1, 200), np.geomspace(1e-7, 1, 200) - 1]).astype(np.float32)
+    found = np.array(two_lobe(t.Float(c), t.Float(g1), t.Float(g2), t.Float(weight)), np.float64)
+    np.testing.assert_allclose(found, two_lobe_numpy(c, g1, g2, weight), rtol=3e-5)
+
+
+@pytest.mark.parametrize("lobes", LOBES)
+def test_sampled_cosines_of_two_lobes_follow_the_density(lobes: tuple[float, float, float]) -> None:
+    samples = lobe_cosines(lobes, 400_000, seed=16)
+    g1, g2, weight = (float(np.float32(v)) for v in lobes)
+    assert samples.min() >= -1
+    assert samples.max() <= 1
+    assert chi_square(samples, g1, g2, weight) > 1e-3
+    for power, expected in ((1, weight * g1 + (1 - weight) * g2), (2, (1 + 2 * (weight * g1**2 + (1 - weight) * g2**2)) / 3)):
+        moment = samples**power
+        assert moment.mean() == pytest.approx(expected, abs=4 * moment.std() / np.sqrt(len(moment)))
+
+
+@pytest.mark.parametrize("wrong", [(0.855, -0.5, 0.8), (0.85, -0.52, 0.8), (0.85, -0.5, 0.81), (0.85, 0.5, 0.8)])
+def test_the_chi_square_sees_each_parameter_of_two_lobes(wrong: tuple[float, float, float]) -> None:
+    assert chi_square(lobe_cosines(wrong, 400_000, seed=17), 0.85, -0.5, 0.8) < 1e-6
+
+
+def test_phase_functions_become_rows_of_lobes() -> None:
+    np.testing.assert_array_equal(as_lobes(np.array([0.5, -0.2])), np.array([[0.5, 0, 1], [-0.2, 0, 1]], np.float32))
+    rows = np.array([[0.9, -0.3, 0.7]], np.float32)
+    np.testing.assert_array_equal(as_lobes(rows), rows)
+    for bad in (np.ones((2, 2)), np.array([1.0]), np.array([[0.5, -1.0, 0.5]]), np.array([[0.5, 0, 1.1]]), np.array([np.nan])):
+        with pytest.raises(ValueError, match="phase function"):
+            as_lobes(bad)
 
 
 def directions(count: int) -> NDArray[np.float32]:
