@@ -95,7 +95,7 @@ class Descriptor:
         self._spacings = [dr.opaque(types.Float, s) for s in spacings]
         self._opaque_unit = dr.opaque(types.Float, self.unit)
 
-    def levels(self, points: Any, w: Any, omega_sun: Any, azimuth: Any | None = None) -> list[Any]:
+    def levels(self, points: Any, w: Any, omega_sun: Any, azimuth: Any | None = None, side: Any | None = None) -> list[Any]:
         """Stencils of n points, one Dr.Jit array of n * 225 float32 for each level, layout [point][z][y][x], finest level first.
 
         Parameters
@@ -108,12 +108,16 @@ class Descriptor:
             Array3f, unit directions TOWARD the light.
         azimuth
             Float, angle in radians that turns the stencil where view and light are parallel (default 0).
+        side
+            Float, 1 or -1: where -1, the stencil is mirrored across the plane of light and view, which leaves J unchanged (default 1).
         """
         types = self.field.types
         n = dr.width(points, w, omega_sun)
         if self.empty or n == 0:
             return [dr.zeros(types.Float, n * POINTS) for _ in range(LEVELS)]
         x_axis, y_axis, z_axis = self._axes(w, omega_sun, azimuth)
+        if side is not None:
+            x_axis = x_axis * side
         # A lane does one row of five points along x, so that what it gathers of its point is shared by five lookups.
         lane = dr.arange(types.UInt32, n * _ROWS)
         point = lane // _ROWS
@@ -152,15 +156,21 @@ class Descriptor:
         return result
 
     def stencils_numpy(
-        self, points: ArrayLike, w: ArrayLike, omega_sun: ArrayLike, azimuth: ArrayLike | None = None
+        self,
+        points: ArrayLike,
+        w: ArrayLike,
+        omega_sun: ArrayLike,
+        azimuth: ArrayLike | None = None,
+        side: ArrayLike | None = None,
+        out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Stencils (n, 10, 225) of NumPy arrays of points and directions, each (n, 3), and azimuths (n,)."""
+        """Stencils (n, 10, 225) of NumPy arrays of points and directions, each (n, 3), and azimuths and sides (n,); into `out` if given."""
         types = self.field.types
         x, d, sun = (types.Array3f(np.ascontiguousarray(np.asarray(a, np.float32).T)) for a in (points, w, omega_sun))
-        turn = None if azimuth is None else types.Float(np.ascontiguousarray(azimuth, np.float32))
+        turn, flip = (None if a is None else types.Float(np.ascontiguousarray(a, np.float32)) for a in (azimuth, side))
         n = len(np.asarray(points))
-        result = np.empty((n, LEVELS, POINTS), np.float32)
-        for k, level in enumerate(self.levels(x, d, sun, turn)):
+        result = np.empty((n, LEVELS, POINTS), np.float32) if out is None else out
+        for k, level in enumerate(self.levels(x, d, sun, turn, flip)):
             result[:, k] = level.numpy().reshape(n, POINTS)
         return result
 

@@ -81,6 +81,18 @@ def test_layout_is_x_fastest_and_z_toward_the_light() -> None:
     assert tuple(offsets()[int(np.argmax(value))]) == (2, 0, 0)
 
 
+def test_the_other_side_is_the_mirror_image(cloud: Volume) -> None:
+    descriptor = Descriptor(Field(backend("llvm"), cloud, 30.0))
+    arguments = queries(cloud)
+    side = np.where(np.arange(24) % 2, -1.0, 1.0)
+    plain, turned = descriptor.stencils_numpy(*arguments), descriptor.stencils_numpy(*arguments, side=side)
+    flipped = plain.reshape(24, LEVELS, 9, 5, 5)[..., ::-1].reshape(plain.shape)
+    expected = np.where(side[:, None, None] < 0, flipped, plain)
+    assert np.mean(np.abs(plain - flipped) > 1e-3) > 0.05
+    # A point within rounding of the hard cut at the box may fall on either side.
+    assert np.mean(np.abs(turned - expected) > 1e-3) < 5e-4
+
+
 def test_frame_is_right_handed_and_perpendicular_to_the_view() -> None:
     rng = np.random.default_rng(3)
     for w, sun in zip(random_directions(rng, 20), random_directions(rng, 20), strict=True):

@@ -111,9 +111,11 @@ class SampleSource:
             number, visit = self._turn(k * config.shards + i)
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(1, number, visit)))
             factor = config.unit_jitter ** rng.uniform(-1.0, 1.0)
-            part = self.draw(self.shards[number], config.queries, rng, factor, config.mirror)
+            place = slice(i * config.queries, (i + 1) * config.queries)
+            part = self.draw(self.shards[number], config.queries, rng, factor, config.mirror, self._pool.stencil[place])
             for field in fields(Samples):
-                getattr(self._pool, field.name)[i * config.queries : (i + 1) * config.queries] = getattr(part, field.name)
+                if field.name != "stencil":
+                    getattr(self._pool, field.name)[place] = getattr(part, field.name)
         return self._pool
 
     def every_shard(self, queries: int) -> Samples:
@@ -124,8 +126,16 @@ class SampleSource:
             parts.append(self.draw(info, queries, rng, 1.0, False))
         return Samples(**{field.name: np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Samples)})
 
-    def draw(self, info: ShardInfo, queries: int, rng: np.random.Generator, unit_factor: float, mirror: bool) -> Samples:
-        """Random queries of one shard, stencils built with the shard's own unit of length times `unit_factor`."""
+    def draw(
+        self,
+        info: ShardInfo,
+        queries: int,
+        rng: np.random.Generator,
+        unit_factor: float,
+        mirror: bool,
+        out: NDArray[np.float32] | None = None,
+    ) -> Samples:
+        """Random queries of one shard, stencils built with the shard's own unit of length times `unit_factor`; into `out` if given."""
         shard, field = self._load(info)
         descriptor = Descriptor(field, unit=unit_factor * default_unit(field))
         i = rng.integers(0, len(shard.point), queries)
@@ -133,11 +143,8 @@ class SampleSource:
         m = rng.integers(0, shard.albedo.shape[1], queries)
         azimuth = rng.uniform(0.0, 2 * np.pi, queries)
         w, sun = shard.w[i], shard.omega_sun[i, k]
-        stencil = descriptor.stencils_numpy(shard.point[i], w, sun, azimuth)
-        if mirror:
-            turned = np.flatnonzero(rng.random(queries) < 0.5)
-            rows = stencil.reshape(queries, LEVELS, 9, 5, 5)
-            rows[turned] = rows[turned, ..., ::-1]
+        side = np.where(rng.random(queries) < 0.5, -1.0, 1.0) if mirror else None
+        stencil = descriptor.stencils_numpy(shard.point[i], w, sun, azimuth, side, out)
         one, zero = np.ones(queries), np.zeros(queries)
         aux = aux_inputs(angle_between(w, sun), shard.g[i], zero, one, shard.albedo[i, m], shard.tau_sun[i, k])
         label, error = shard.label[i, k, m], shard.error[i, k, m]
