@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from deepclouds.medium.field import Field
-from deepclouds.medium.optical_depth import distance_at, optical_depth
+from deepclouds.medium.optical_depth import TAU_OPAQUE, distance_at, optical_depth
 from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
 from deepclouds_runtime import stratified
 from deepclouds_runtime.lights import LightSource, Shade
@@ -170,12 +171,9 @@ def _scatter(
     result: CloudLight,
 ) -> None:
     """Add single and multiple scattering at `points` to the lanes of `result`, for every light."""
-    types, medium = cloud.field.types, cloud.field
+    types = cloud.field.types
     channel_count = len(cloud.albedo)
     albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
-    g = dr.opaque(types.Float, cloud.g)
-    direct = [dr.zeros(types.Float, len(lanes)) for _ in range(channel_count)]
-    jitter = numbers.number(stratified.SHADOW)
     # Which samples are worth a query is the same for all lights: one that lies in a thin place is so for each of them.
     keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
     asked = numbers.number(stratified.ROULETTE) < keep
@@ -184,13 +182,7 @@ def _scatter(
     take = _taker(types, queries)
     target = dr.gather(types.UInt32, lanes, queries)
 
-    def light(omega: Any, radiance: list[Any], share: Any) -> None:
-        """One direction: `radiance` is what arrives over the density of the direction (the irradiance, of a sun)."""
-        tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True), _DEEP)
-        single = hg(dr.dot(w, omega), g) * dr.exp(-tau) * share
-        for c in range(channel_count):
-            direct[c] += albedo[c] * radiance[c] * single
-        dr.eval(tau, direct, radiance)
+    def predict(omega: Any, radiance: list[Any], tau: Any) -> None:
         if cloud.scattering is not None and len(queries):
             different = tuple(sorted(set(cloud.albedo)))
             counts.queries += len(queries) * len(different)
@@ -200,6 +192,47 @@ def _scatter(
                 value = types.Float(np.ascontiguousarray(j[:, different.index(cloud.albedo[c])]))
                 value = value * (albedo[c] * albedo[c] * (0.25 / dr.pi)) * weight * take(radiance[c])
                 dr.scatter_add(result.indirect[c], value, target)
+
+    direct = single_scattering(cloud, lights, points, w, numbers, predict)
+    for c in range(channel_count):
+        dr.scatter(result.direct[c], direct[c] * opacity, lanes)
+
+
+def single_scattering(
+    cloud: Cloud, lights: Lights, points: Any, w: Any, numbers: Stratified, each: Callable[[Any, list[Any], Any], None] | None = None
+) -> list[Any]:
+    """S1 of all lights at points of the cloud seen along `w`; one array a colour channel.
+
+    Parameters
+    ----------
+    cloud, lights
+        the medium and what lights it.
+    points, w
+        Array3f: world points and unit directions of the camera rays' travel.
+    numbers
+        random numbers of the lanes.
+    each
+        is called for every direction that light was drawn from, with the direction, the radiance that arrives over the direction's density
+        (the irradiance, of a sun), and the whole optical depth toward it.
+    """
+    types, medium = cloud.field.types, cloud.field
+    channel_count, n = len(cloud.albedo), dr.width(points)
+    albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
+    g = dr.opaque(types.Float, cloud.g)
+    direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
+    jitter = numbers.number(stratified.SHADOW)
+    # A network is told the whole depth.
+    deepest = _DEEP if each is not None else TAU_OPAQUE
+
+    def light(omega: Any, radiance: list[Any], share: Any) -> None:
+        """One direction: `radiance` is what arrives over the density of the direction."""
+        tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True), deepest)
+        single = hg(dr.dot(w, omega), g) * dr.exp(-tau) * share
+        for c in range(channel_count):
+            direct[c] += albedo[c] * radiance[c] * single
+        if each is not None:
+            dr.eval(tau, direct, radiance)
+            each(omega, radiance, tau)
 
     for sun in lights.suns:
         omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
@@ -220,5 +253,4 @@ def _scatter(
             for c, value in enumerate(source.arriving(points, omega, numbers)):
                 direct[c] += albedo[c] * value * share
             dr.eval(direct)
-    for c in range(channel_count):
-        dr.scatter(result.direct[c], direct[c] * opacity, lanes)
+    return direct
