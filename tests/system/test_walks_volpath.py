@@ -229,7 +229,7 @@ def test_labels_are_refused_where_they_cannot_be_formed(mi: Any) -> None:
     for albedo in (0.0, 1.5, np.nan):
         with pytest.raises(InputError, match="albedo"):
             trace_walks_mitsuba(volume, scale, points, w, single, suns, one * albedo, 4, seed=1)
-    with pytest.raises(InputError, match=r"g = 1\.0"):
+    with pytest.raises(InputError, match="-1 < g1"):
         trace_walks_mitsuba(volume, scale, points, w, single + 1, suns, one, 4, seed=1)
     empty = trace_walks_mitsuba(volume, 0.0, points, w, single, suns, one, 4, seed=1)
     np.testing.assert_array_equal(empty, np.zeros((1, 4, 1, 1)))

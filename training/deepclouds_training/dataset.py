@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import os
 import shutil
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +13,8 @@ import numpy as np
 
 from deepclouds.errors import InputError
 from deepclouds.replacing import replacing
-from deepclouds_training.shards import Dataset, ShardInfo, open_dataset, read_shard, shard_file, write_manifest
+from deepclouds_training.dataset_info import print_info
+from deepclouds_training.shards import Dataset, check_shard, open_dataset, shard_file, write_manifest, write_record
 
 
 def main(argv: Sequence[str], prog: str) -> int:
@@ -24,10 +23,11 @@ def main(argv: Sequence[str], prog: str) -> int:
     verbs = parser.add_subparsers(dest="verb", required=True)
     info = verbs.add_parser("info", help="counts, ranges and noise of the labels")
     info.add_argument("folder", type=Path)
-    merge = verbs.add_parser("merge", help="join data sets into one")
+    info.add_argument("--picture", type=Path, help="write histograms there, a .png")
+    merge = verbs.add_parser("merge", help="join the parts of one data set, or different data sets, into one")
     merge.add_argument("folders", type=Path, nargs="+", help="data sets with the same schema and tracer")
     merge.add_argument("-o", "--output", type=Path, required=True, help="folder of the joined data set; must not exist")
-    verify = verbs.add_parser("verify", help="check every shard against the hash in the manifest")
+    verify = verbs.add_parser("verify", help="check every shard against the hash in its record")
     verify.add_argument("folder", type=Path)
     export = verbs.add_parser("export-stencils", help="write stencils, inputs and labels as one .npz file")
     export.add_argument("folder", type=Path)
@@ -42,7 +42,7 @@ def main(argv: Sequence[str], prog: str) -> int:
         return 0
     dataset = open_dataset(arguments.folder)
     if arguments.verb == "info":
-        _info(dataset)
+        print_info(dataset, arguments.picture)
         return 0
     if arguments.verb == "verify":
         return _verify(dataset)
@@ -52,30 +52,6 @@ def main(argv: Sequence[str], prog: str) -> int:
         raise InputError("--queries and --shards must be at least 1")
     _export(dataset, arguments.output, arguments.split, arguments.queries, arguments.shards, arguments.seed)
     return 0
-
-
-def _info(dataset: Dataset) -> None:
-    total = dataset.manifest.get("total_shards", len(dataset.shards))
-    points = sum(s.count for s in dataset.shards)
-    print(f"{dataset.folder}: {len(dataset.shards)} of {total} shards, {points} points, tracer {dataset.manifest.get('tracer')}")
-    for split in ("train", "valid"):
-        families = Counter(s.family for s in dataset.shards if s.split == split)
-        print(f"  {split}: {sum(families.values())} clouds: {', '.join(f'{name} {count}' for name, count in sorted(families.items()))}")
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("size", "g", "albedo", "tau_sun", "label", "relative error")}
-    for entry in dataset.shards:
-        shard, header = read_shard(dataset.folder / entry.file)
-        seen = shard.label > 0.01 * shard.label.mean()
-        rows["size"].append(np.array([header["size"]]))
-        rows["g"].append(shard.g)
-        rows["albedo"].append(shard.albedo.ravel())
-        rows["tau_sun"].append(shard.tau_sun.ravel())
-        rows["label"].append(shard.label.ravel()[:: max(1, shard.label.size // 4096)])
-        rows["relative error"].append((shard.error[seen] / shard.label[seen])[:: max(1, int(seen.sum()) // 4096)])
-    print(f"  {'':16s}{'least':>10s}{'5 %':>10s}{'median':>10s}{'mean':>10s}{'95 %':>10s}{'largest':>12s}")
-    for name, parts in rows.items():
-        values = np.concatenate(parts) if parts else np.zeros(1)
-        low, five, middle, ninety_five, high = np.percentile(values, (0, 5, 50, 95, 100))
-        print(f"  {name:16s}{low:10.4g}{five:10.4g}{middle:10.4g}{values.mean():10.4g}{ninety_five:10.4g}{high:12.4g}")
 
 
 def _merge(datasets: list[Dataset], output: Path) -> None:
@@ -88,40 +64,51 @@ def _merge(datasets: list[Dataset], output: Path) -> None:
         raise InputError(f"families {sorted(both)} are trained on in one data set and held out in another: they cannot be joined")
     if output.exists():
         raise InputError(f"{output}: exists already; name a new folder")
+    entries = [(d, entry) for d in datasets for entry in d.shards]
+    # The parts of one data set become what one machine would have made, under the same numbers; different ones are numbered anew.
+    if all(d.manifest == datasets[0].manifest for d in datasets) and "config_hash" in datasets[0].manifest:
+        manifest = datasets[0].manifest
+        chosen = {entry.index: (d, entry) for d, entry in entries}
+        for d, entry in entries:
+            other, same = chosen[entry.index]
+            if entry.sha256 != same.sha256:
+                raise InputError(f"{d.folder / entry.file} and {other.folder / same.file} differ: one of the two is not of this data set")
+    else:
+        sources = [{"config": d.manifest.get("config"), "config_hash": d.manifest.get("config_hash"), "hash": d.hash} for d in datasets]
+        manifest = {"merged": sources, "tracer": tracers[0], "total_shards": len(entries)}
+        chosen = {i: (d, replace(entry, index=i, file=shard_file(i))) for i, (d, entry) in enumerate(entries)}
+    names = {(d.folder, entry.sha256): entry.file for d, entry in entries}
     # Made under another name and renamed, so that an interrupted merge leaves nothing that looks like a data set.
     partial = output.with_name(f".{output.name}.{os.getpid()}.tmp")
     partial.mkdir(parents=True)
     try:
-        shards: dict[int, ShardInfo] = {}
-        for dataset in datasets:
-            for entry in dataset.shards:
-                index = len(shards)
-                target = partial / shard_file(index)
-                # The bytes are the same: a second name costs no disk where both folders share one.
-                try:
-                    os.link(dataset.folder / entry.file, target)
-                except OSError:
-                    shutil.copyfile(dataset.folder / entry.file, target)
-                shards[index] = replace(entry, index=index, file=target.name)
-        sources = [{"config": d.manifest.get("config"), "config_hash": d.manifest.get("config_hash"), "hash": d.hash} for d in datasets]
-        write_manifest(partial, {"merged": sources, "tracer": tracers[0], "total_shards": len(shards)}, shards)
+        for d, entry in (chosen[index] for index in sorted(chosen)):
+            source, target = d.folder / names[d.folder, entry.sha256], partial / entry.file
+            check_shard(source, entry.sha256)
+            # The bytes are the same: a second name costs no disk where both folders share one.
+            try:
+                os.link(source, target)
+            except OSError:
+                shutil.copyfile(source, target)
+            write_record(partial, entry)
+        write_manifest(partial, manifest)
         partial.rename(output)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    print(f"{output}: {len(shards)} shards of {len(datasets)} data sets")
+    print(f"{output}: {len(chosen)} of {manifest['total_shards']} shards, from {len(datasets)} data sets")
 
 
 def _verify(dataset: Dataset) -> int:
     bad = []
     for entry in dataset.shards:
-        path = dataset.folder / entry.file
-        if not path.exists():
-            bad.append(f"{path}: missing")
-        elif hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
-            bad.append(f"{path}: its bytes are not those of the manifest")
+        try:
+            check_shard(dataset.folder / entry.file, entry.sha256)
+        except InputError as error:
+            bad.append(str(error))
     if bad:
-        raise InputError("\n".join([*bad, "run `deepclouds generate` again: it makes the damaged shards anew"]))
-    print(f"{dataset.folder}: all {len(dataset.shards)} shards are whole")
+        raise InputError("\n".join(bad))
+    total = dataset.manifest.get("total_shards", len(dataset.shards))
+    print(f"{dataset.folder}: {len(dataset.shards)} of {total} shards, all whole")
     return 0
 
 
@@ -139,6 +126,7 @@ def _export(dataset: Dataset, output: Path, split: str, queries: int, most: int 
             aux=samples.aux,
             label=samples.label,
             error=samples.error,
+            half=samples.half,
             shard=samples.shard,
             dataset_hash=np.array(dataset.hash),
         )

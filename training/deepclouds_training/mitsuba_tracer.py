@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.medium.phase import as_lobes
 from deepclouds.volume import Volume
 
 # Paths in flight at once; volpath keeps some 200 bytes for each.
@@ -22,7 +23,7 @@ def trace_walks_mitsuba(
     scale: float,
     points: NDArray[np.float32],
     directions: NDArray[np.float32],
-    g: NDArray[np.float32],
+    phase: NDArray[np.float32],
     suns: NDArray[np.float32],
     albedos: NDArray[np.float32],
     walks: int,
@@ -30,8 +31,8 @@ def trace_walks_mitsuba(
 ) -> NDArray[np.float32]:
     """Unbiased estimates of ``4 pi J / (albedo^2 E)`` by Mitsuba, one for every walk.
 
-    Each walk samples ``w'`` from Mitsuba's ``hg`` around `directions` and follows it with ``volpath``; a sun is a delta light that no
-    ray can hit, so ``volpath`` returns exactly what has scattered at least once on its way to the point.
+    Each walk samples ``w'`` from Mitsuba's phase function around `directions` and follows it with ``volpath``; a sun is a delta light
+    that no ray can hit, so ``volpath`` returns exactly what has scattered at least once on its way to the point.
 
     Parameters
     ----------
@@ -41,8 +42,8 @@ def trace_walks_mitsuba(
         (n, 3) world points, inside or outside of the box.
     directions
         (n, 3) unit vectors w, the camera ray's travel.
-    g
-        (n,) Henyey-Greenstein parameters, -1 < g < 1.
+    phase
+        (n, 3) lobes (g1, g2, weight), or (n,) Henyey-Greenstein parameters g of single lobes.
     suns
         (n, k, 3) unit vectors TOWARD the suns.
     albedos
@@ -60,11 +61,11 @@ def trace_walks_mitsuba(
     ------
     InputError
         when Mitsuba's variant is not set or is none of the ``llvm`` and ``cuda`` variants of ``rgb`` or ``mono``; for an albedo outside
-        of (0, 1] or g outside of (-1, 1).
+        of (0, 1] or a phase function that is none.
 
     Notes
     -----
-    There is one scene for every different (g, sun, albedo): share them between points wherever speed matters.
+    There is one scene for every different (phase function, sun, albedo): share them between points wherever speed matters.
     Roulette is off (it counts null collisions and would end paths at albedo 1) and so is the limit of the depth.
     """
     mi = _mitsuba()
@@ -74,42 +75,43 @@ def trace_walks_mitsuba(
     bad = albedos[~((albedos > 0) & (albedos <= 1))]
     if bad.size:
         raise InputError(f"albedo {bad[0]} is not in (0, 1]: Mitsuba's labels divide by it")
-    g = np.broadcast_to(np.asarray(g, np.float32), (n,))
-    if np.any(~(np.abs(g) < 1)):
-        raise InputError(f"g = {g[~(np.abs(g) < 1)][0]} is not in (-1, 1)")
+    try:
+        lobes = as_lobes(phase)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     result = np.zeros((n, walks, k_suns, m_albedos), np.float32)
     if result.size == 0 or scale * float(volume.density.max()) == 0:
         return result
 
-    jobs = [(i, k, m) for i in range(n) for k in range(k_suns) for m in range(m_albedos)]
+    row, sun, column = (a.ravel() for a in np.indices((n, k_suns, m_albedos)))
     # volpath believes what it is told of the medium it starts in, so that is decided by geometry.
     unit = (points.astype(np.float64) - volume.to_world[:3, 3]) @ np.linalg.inv(volume.to_world[:3, :3]).T
     inside = np.all((unit > 0) & (unit < 1), axis=1)
-    keys = np.array([[g[i], *suns[i, k], albedos[i, m], inside[i]] for i, k, m in jobs], np.float32)
+    keys = np.column_stack([lobes[row], suns[row, sun], albedos[row, column], inside[row]]).astype(np.float32)
     different, group = np.unique(keys, axis=0, return_inverse=True)
-    streams = iter(np.random.SeedSequence(seed).generate_state(len(jobs), np.uint32))
+    streams = iter(np.random.SeedSequence(seed).generate_state(len(row), np.uint32))
     portion = max(1, _WAVEFRONT // walks)
     for index, key in enumerate(different):
         members = np.flatnonzero(group.ravel() == index)
-        scene = mi.load_dict(scene_dict(volume, scale, float(key[0]), key[1:4], float(key[4])))
+        scene = mi.load_dict(scene_dict(volume, scale, key[:3], key[3:6], float(key[6])))
         for start in range(0, len(members), portion):
-            chosen = np.array([jobs[member] for member in members[start : start + portion]])
-            rows = chosen[:, 0]
-            radiance = _trace(mi, scene, bool(key[5]), points[rows], directions[rows], walks, int(next(streams)))
+            chosen = members[start : start + portion]
+            rows = row[chosen]
+            radiance = _trace(mi, scene, bool(key[7]), points[rows], directions[rows], walks, int(next(streams)))
             # E = 1, and J = albedo * radiance: of the two powers of the albedo in the label one cancels.
-            result[rows, :, chosen[:, 1], chosen[:, 2]] = 4 * np.pi * radiance / key[4]
+            result[rows, :, sun[chosen], column[chosen]] = 4 * np.pi * radiance / key[6]
     return result
 
 
-def scene_dict(volume: Volume, scale: float, g: float, omega_sun: ArrayLike, albedo: float) -> dict[str, Any]:
+def scene_dict(volume: Volume, scale: float, phase: ArrayLike, omega_sun: ArrayLike, albedo: float) -> dict[str, Any]:
     """Mitsuba scene (for ``load_dict``): the volume in its box under a sun of irradiance 1, and the integrator that is safe for it.
 
     Parameters
     ----------
     volume, scale
         density, and extinction per unit of density, 1 / world length.
-    g
-        Henyey-Greenstein parameter.
+    phase
+        lobes (g1, g2, weight), or the parameter g of a single lobe.
     omega_sun
         unit vector TOWARD the sun.
     albedo
@@ -148,10 +150,23 @@ def scene_dict(volume: Volume, scale: float, g: float, omega_sun: ArrayLike, alb
                 "albedo": {"type": "constvolume", "value": _grey(mi, albedo)},
                 "scale": float(scale),
                 "has_spectral_extinction": False,
-                "phase": {"type": "hg", "g": float(g)},
+                "phase": _phase_dict(phase),
             },
         },
     }
+
+
+def _phase_dict(phase: ArrayLike) -> dict[str, Any]:
+    g1, g2, weight = (float(v) for v in as_lobes(np.atleast_1d(phase) if np.ndim(phase) == 0 else np.asarray(phase)[None])[0])
+    first = {"type": "hg", "g": g1}
+    # blendphase's weight is that of its second phase function.
+    second = {
+        "type": "blendphase",
+        "weight": {"type": "constvolume", "value": 1 - weight},
+        "first": first,
+        "second": {"type": "hg", "g": g2},
+    }
+    return first if weight == 1 else second
 
 
 def _grey(mi: Any, value: float) -> Any:

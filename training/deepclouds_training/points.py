@@ -1,9 +1,10 @@
 """Where and along which directions labels are taken: the sampling density of the data set.
 
-A camera sees first collisions, so most points are first collisions of random lines through the cloud's bounding sphere; some lie
-deeper along the same line, where a dense front is nearly opaque, and some anywhere in and around the box, where interpolation nodes and
-thin fringes lie. Suns are uniform over the sphere, but for one a point that looks along the line of sight or back along it: phase peaks and
-the antisolar point are small solid angles that uniform suns would leave nearly empty.
+A camera sees first collisions of its rays, so these are the backbone: first collisions of random lines through the cloud's bounding
+sphere. A fast renderer interpolates J between nodes of a sparse lattice around them, so many points stand up to two units of length
+beside a first collision, along the same line of sight: in front of it, behind it, and in the void. The rest lies deeper along
+the line, anywhere inside, and anywhere in and around the box. Suns are uniform over the sphere, but for one a point that looks along the
+line of sight or back along it: phase peaks and the antisolar point are small solid angles that uniform suns would leave nearly empty.
 """
 
 from __future__ import annotations
@@ -12,12 +13,16 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from deepclouds.descriptor import default_unit
 from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
-from deepclouds_training.shards import ANYWHERE, FIRST_COLLISION, SECOND_COLLISION
+from deepclouds_training.shards import ANYWHERE, BESIDE, FIRST_COLLISION, INSIDE, SECOND_COLLISION
 
 # Lines traced at the most for the collisions of one kind in one cloud.
 _MOST_LINES = 2**21
+# Nodes of a renderer's lattice lie within about so many units of length of a first collision, and within so large a part of the cloud.
+_BESIDE_UNITS = 2.0
+_BESIDE_SHARE = 0.25
 
 
 def uniform_directions(rng: Generator, *shape: int) -> NDArray[np.float32]:
@@ -46,26 +51,36 @@ def random_lines(rng: Generator, field: Field, n: int) -> tuple[NDArray[np.float
 
 
 def sample_points(
-    rng: Generator, field: Field, n: int, deeper: float, anywhere: float
+    rng: Generator, field: Field, n: int, second: float, beside: float, inside: float, anywhere: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Draw `n` points x and directions w; the shares `deeper` and `anywhere` are of the other two kinds.
+    """Draw `n` points x and directions w: first collisions, but for the given shares.
+
+    `second` are second collisions along the same line; `beside` are first collisions moved by up to two units of length (at most a
+    fourth of the longest side) in a random direction; `inside` are in proportion to extinction; `anywhere` are uniform in the box and
+    5 % around it. The last two see in uniform directions.
 
     Returns points (n, 3), directions (n, 3) and kinds (n,), in random order. In a cloud so thin that a bounded number of lines does not
     collide often enough, the missing collisions are drawn in proportion to extinction, which is their distribution in the thin limit.
     """
-    second = round(deeper * n)
-    loose = round(anywhere * n)
-    found = []
-    for kind, wanted in ((FIRST_COLLISION, n - second - loose), (SECOND_COLLISION, second)):
-        points, w = _collisions(rng, field, wanted, kind == SECOND_COLLISION)
-        found.append((points, w, np.full(wanted, kind, np.uint8)))
+    counts = {SECOND_COLLISION: second, BESIDE: beside, INSIDE: inside, ANYWHERE: anywhere}
+    numbers = {kind: round(share * n) for kind, share in counts.items()}
+    # Rounding up every share may ask for more points than there are.
+    while sum(numbers.values()) > n:
+        numbers[max(numbers, key=lambda kind: numbers[kind])] -= 1
+    numbers[FIRST_COLLISION] = n - sum(numbers.values())
     lower, upper = field.volume.bounds
+    found = {kind: _collisions(rng, field, numbers[kind], kind == SECOND_COLLISION) for kind in (FIRST_COLLISION, SECOND_COLLISION, BESIDE)}
+    points, w = found[BESIDE]
+    reach = min(_BESIDE_UNITS * default_unit(field), _BESIDE_SHARE * float(np.max(upper - lower)))
+    length = (reach * rng.random((len(points), 1))).astype(np.float32)
+    found[BESIDE] = points + length * uniform_directions(rng, len(points)), w
+    found[INSIDE] = _in_extinction(rng, field, numbers[INSIDE]), uniform_directions(rng, numbers[INSIDE])
     margin = 0.05 * (upper - lower)
-    anywhere_points = rng.uniform(lower - margin, upper + margin, (loose, 3)).astype(np.float32)
-    found.append((anywhere_points, uniform_directions(rng, loose), np.full(loose, ANYWHERE, np.uint8)))
+    loose = rng.uniform(lower - margin, upper + margin, (numbers[ANYWHERE], 3)).astype(np.float32)
+    found[ANYWHERE] = loose, uniform_directions(rng, len(loose))
     order = rng.permutation(n)
-    points, w, kinds = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
-    return points, w, kinds
+    kinds = np.repeat(np.array(list(found), np.uint8), [len(p) for p, _ in found.values()])
+    return np.concatenate([p for p, _ in found.values()])[order], np.concatenate([d for _, d in found.values()])[order], kinds[order]
 
 
 def _collisions(rng: Generator, field: Field, wanted: int, second: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -110,10 +125,26 @@ def sample_suns(rng: Generator, w: NDArray[np.float32], suns: int) -> NDArray[np
     return result
 
 
-def sample_g(rng: Generator, n: int) -> NDArray[np.float32]:
-    """Henyey-Greenstein parameters: 15 % isotropic, 65 % uniform in 0..0.9, 12 % in 0.8..0.93, 8 % in -0.3..0."""
+def sample_phase(rng: Generator, n: int) -> NDArray[np.float32]:
+    """Phase functions as rows (g1, g2, weight), (n, 3).
+
+    35 % have two lobes: g1 in 0.3..0.95, g2 in -0.5..0.5, weight of the first in 0.5..0.98. The others have one: of them 12 % are
+    isotropic, 53 % uniform in 0..0.9, 25 % in 0.8..0.95, 10 % in -0.3..0.
+    """
+    lobes = np.stack([rng.uniform(0.3, 0.95, n), rng.uniform(-0.5, 0.5, n), rng.uniform(0.5, 0.98, n)], axis=1)
     kind = rng.random(n)
-    g = rng.uniform(0.0, 0.9, n)
-    g = np.where(kind < 0.35, rng.uniform(-0.3, 0.0, n), g)
-    g = np.where(kind < 0.27, rng.uniform(0.8, 0.93, n), g)
-    return np.where(kind < 0.15, 0.0, g).astype(np.float32)
+    g = np.select(
+        [kind < 0.12, kind < 0.65, kind < 0.9],
+        [np.zeros(n), rng.uniform(0.0, 0.9, n), rng.uniform(0.8, 0.95, n)],
+        rng.uniform(-0.3, 0.0, n),
+    )
+    single = rng.random(n) >= 0.35
+    lobes[single] = np.stack([g, np.zeros(n), np.ones(n)], axis=1)[single]
+    return lobes.astype(np.float32)
+
+
+def sample_albedo(rng: Generator, n: int) -> NDArray[np.float32]:
+    """Two albedos a point, (n, 2): 1, which most clouds nearly reach, and ``1 - u^2 / 2``, or in 5 % of the points uniform in 0..0.5."""
+    albedo = np.ones((n, 2))
+    albedo[:, 1] = np.where(rng.random(n) < 0.05, rng.uniform(0, 0.5, n), 1 - 0.5 * rng.random(n) ** 2)
+    return albedo.astype(np.float32)

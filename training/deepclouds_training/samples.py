@@ -50,12 +50,13 @@ class SampleConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Samples:
-    """n samples: stencil (n, 10, 225), aux (n, 6), label and its standard error (n,), and the shard each came from (n,)."""
+    """n samples: stencil (n, 10, 225), aux (n, 6), label, its standard error, its independent halves (n, 2), and the shard it came from."""
 
     stencil: NDArray[np.float32]
     aux: NDArray[np.float32]
     label: NDArray[np.float32]
     error: NDArray[np.float32]
+    half: NDArray[np.float32]
     shard: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -145,13 +146,13 @@ class SampleSource:
         w, sun = shard.w[i], shard.omega_sun[i, k]
         side = np.where(rng.random(queries) < 0.5, -1.0, 1.0) if mirror else None
         stencil = descriptor.stencils_numpy(shard.point[i], w, sun, azimuth, side, out)
-        one, zero = np.ones(queries), np.zeros(queries)
-        aux = aux_inputs(angle_between(w, sun), shard.g[i], zero, one, shard.albedo[i, m], shard.tau_sun[i, k])
-        label, error = shard.label[i, k, m], shard.error[i, k, m]
+        aux = aux_inputs(angle_between(w, sun), *shard.phase[i].T, shard.albedo[i, m], shard.tau_sun[i, k])
+        half, error = shard.half[i, k, m], shard.error[i, k, m]
+        label = half.mean(axis=-1)
         if not (np.all(np.isfinite(label)) and np.all(np.isfinite(error)) and np.all(np.isfinite(stencil))):
             path = self.dataset.folder / info.file
             raise InputError(f"{path}: labels or stencils are not finite; delete the shard and generate it again")
-        return Samples(stencil, aux, label, error, np.full(queries, info.index, np.int64))
+        return Samples(stencil, aux, label, error, half, np.full(queries, info.index, np.int64))
 
     def _turn(self, position: int) -> tuple[int, int]:
         """Shard number and visit at a position of the endless sequence that visits all shards in a new random order each time."""
@@ -185,5 +186,6 @@ def _empty(n: int) -> Samples:
         np.empty((n, len(AUX)), np.float32),
         np.empty(n, np.float32),
         np.empty(n, np.float32),
+        np.empty((n, 2), np.float32),
         np.empty(n, np.int64),
     )
