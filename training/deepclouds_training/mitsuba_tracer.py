@@ -117,7 +117,8 @@ def scene_dict(volume: Volume, scale: float, phase: ArrayLike, omega_sun: ArrayL
     albedo
         single-scattering albedo, grey.
     """
-    mi = _mitsuba()
+    import mitsuba as mi
+
     # Mitsuba's cube spans [-1, 1]^3. It is symmetric, so a mirrored box is made of an unmirrored cube, whose normals point outward.
     half = np.diag([0.5, 0.5, 0.5, 1.0])
     half[:3, 3] = 0.5
