@@ -84,6 +84,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     volume.add_argument("--albedo", type=_numbers((1, 3)), metavar="A|R,G,B", help="single-scattering albedo (default 1)")
     volume.add_argument("--g", type=float, help="Henyey-Greenstein parameter, -1 to 1 (default 0.85)")
     volume.add_argument(
+        "--phase",
+        type=_numbers((3,)),
+        metavar="G1,G2,WEIGHT",
+        help="two Henyey-Greenstein lobes and the first one's weight, in place of --g",
+    )
+    volume.add_argument(
         "--sun", type=_numbers((2,)), metavar=_PAIR, help="where the sun stands, degrees; azimuth 0 is +Z and grows to +X (default 100,35)"
     )
     volume.add_argument("--irradiance", type=_numbers((1, 3)), metavar="E|R,G,B", help="of the sun, perpendicular to it (default 12)")
@@ -97,9 +103,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     return parser
 
 
-_VOLUME = ("optical_depth", "extinction", "albedo", "g", "sun", "irradiance", "env", "sky", "up", "view", "size")
+_VOLUME = ("optical_depth", "extinction", "albedo", "g", "phase", "sun", "irradiance", "env", "sky", "up", "view", "size")
 _BOTH = ("max_depth", "hide_emitters")
-_MAY_BE_NEGATIVE = ("--sun", "--view", "--albedo", "--irradiance", "--sky", "--size")
+_MAY_BE_NEGATIVE = ("--phase", "--sun", "--view", "--albedo", "--irradiance", "--sky", "--size")
 
 
 def run(argv: Sequence[str], prog: str) -> int:
@@ -154,7 +160,7 @@ def run(argv: Sequence[str], prog: str) -> int:
         "hide_emitters": renderer.scene.hide_emitters,
         "extinction": renderer.scene.scale,
         "albedo": renderer.scene.albedo,
-        "g": renderer.scene.g,
+        "phase": renderer.scene.phase,
         "max_depth": renderer.scene.max_depth,
         "model_hash": renderer.model_hash,
     }
@@ -187,12 +193,17 @@ def _describe(renderer: Renderer, say: Callable[[str], None]) -> None:
     x, y, z = scene.volume.resolution
     width, height = scene.size
     albedo = ", ".join(f"{a:g}" for a in scene.albedo)
-    say(f"cloud of {x} x {y} x {z} voxels, extinction {scene.scale:.5g} at density 1, albedo {albedo}, g {scene.g:g}")
+    say(f"cloud of {x} x {y} x {z} voxels, extinction {scene.scale:.5g} at density 1, albedo {albedo}, {_phase_words(scene.phase)}")
     lights = [f"{len(scene.suns)} sun{'s' if len(scene.suns) > 1 else ''}"] if scene.suns else []
     lights += [scene.environment.class_name()] if scene.environment is not None else []
     say(f"image of {width} x {height} pixels; lights: {', '.join(lights) or 'none'}")
     for note in scene.notes:
         say(f"note: {note}")
+
+
+def _phase_words(phase: tuple[float, float, float]) -> str:
+    g1, g2, weight = phase
+    return f"g {g1:g}" if weight == 1 else f"g {g1:g} and {g2:g} with weights {weight:g} and {1 - weight:g}"
 
 
 def _report(result: RenderResult, say: Callable[[str], None]) -> None:

@@ -27,6 +27,8 @@ def predict(
     model: str | PathLike[str] | None = None,
     predictor: Predicts | None = None,
     backend: str = "llvm",
+    g2: float = 0.0,
+    lobe_weight: float = 1.0,
 ) -> NDArray[np.float64]:
     """Source term of multiple scattering over the sun's irradiance, J / E.
 
@@ -52,6 +54,8 @@ def predict(
         any object with ``predict``, in place of `model`.
     backend
         ``"llvm"`` or ``"cuda"``.
+    g2, lobe_weight
+        parameter of a second lobe, and the weight of the first: the phase function is ``lobe_weight HG(g) + (1 - lobe_weight) HG(g2)``.
 
     Returns
     -------
@@ -85,7 +89,7 @@ def predict(
     p, d, s = upload(x), upload(w), upload(suns)
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
     network = predictor if predictor is not None else _predictor(None if model is None else fspath(model))
-    j = NetworkScattering(field, network)(p, d, s, g, (albedo,), tau)
+    j = NetworkScattering(field, network)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)
 
 

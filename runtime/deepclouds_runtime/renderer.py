@@ -150,7 +150,7 @@ class Renderer:
         scattering = None
         if scene.max_depth != 2:
             scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
-        cloud, lights = Cloud(self._field, scene.albedo, scene.g, scattering), self._lights()
+        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering), self._lights()
         work = _Work(scene, cloud, lights, lights, types, samples, seed, self._interreflection)
         work.spent("lights", started)
         if self._interreflection:

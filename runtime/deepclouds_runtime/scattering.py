@@ -14,6 +14,7 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
 from deepclouds.model import aux_inputs
 
+Phase = tuple[float, float, float]
 # Stencils are 9 kB each: a chunk of them stays below 100 MB.
 _CHUNK = 8192
 
@@ -21,15 +22,15 @@ _CHUNK = 8192
 class MultipleScattering(Protocol):
     """Source of ``j = 4 pi J / (albedo^2 E)``."""
 
-    def __call__(self, points: Any, w: Any, omega_sun: Any, g: float, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
         """Dimensionless j (n, albedos).
 
         Parameters
         ----------
         points, w, omega_sun
             Array3f: world points, unit directions of the camera rays' travel, unit vectors TOWARD the light.
-        g
-            Henyey-Greenstein parameter.
+        phase
+            phase function (g1, g2, weight), see `deepclouds.medium.phase`.
         albedos
             the DIFFERENT albedos among the colour channels.
         tau
@@ -64,7 +65,7 @@ class NetworkScattering:
         self.predictor = predictor
         self._types = field.types
 
-    def __call__(self, points: Any, w: Any, omega_sun: Any, g: float, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
         """J of the points; see `MultipleScattering`."""
         # The arc cosine of a float32 cosine loses half of its digits near 0 and pi; the cross product keeps them.
         gamma = np.array(dr.atan2(dr.norm(dr.cross(w, omega_sun)), dr.dot(w, omega_sun)))
@@ -82,7 +83,7 @@ class NetworkScattering:
             for k, level in enumerate(self.descriptor.levels(*part)):
                 stencil[:, k] = level.numpy().reshape(-1, POINTS)
             for m, albedo in enumerate(albedos):
-                aux = aux_inputs(gamma[start:stop], g, 0.0, 1.0, albedo, depth[start:stop])
+                aux = aux_inputs(gamma[start:stop], *phase, albedo, depth[start:stop])
                 result[start:stop, m] = self.predictor.predict(stencil, aux)
         return result
 
@@ -104,7 +105,7 @@ class WalkScattering:
         self._field, self._walks = field, walks
         self._streams = np.random.SeedSequence(seed)
 
-    def __call__(self, points: Any, w: Any, omega_sun: Any, g: float, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
         """J of the points; see `MultipleScattering`."""
         x, d, suns = (np.array(v).T.astype(np.float32) for v in (points, w, omega_sun))
         n = len(x)
@@ -113,7 +114,7 @@ class WalkScattering:
             self._field,
             x,
             d,
-            np.full(n, g, np.float32),
+            np.broadcast_to(np.array(phase, np.float32), (n, 3)),
             np.broadcast_to(suns, (n, 3))[:, None, :],
             np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos))),
             self._walks,

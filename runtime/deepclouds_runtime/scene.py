@@ -17,7 +17,8 @@ from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.placement import box_transform, cube_transform, locate
 
 _LOG = logging.getLogger(__name__)
-_PHASES = {"HGPhaseFunction": "hg", "IsotropicPhaseFunction": "isotropic"}
+_LOBES = ("HGPhaseFunction", "IsotropicPhaseFunction")
+_PHASE_NAMES = "`hg`, `isotropic` and a `blendphase` of two of them"
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 _UNLIMITED = 0xFFFFFFFF
 # A homogeneous ball becomes a grid of this many voxels a side, each filled by the share of it that lies inside.
@@ -48,8 +49,8 @@ class CloudScene:
         extinction per unit of density, 1 / world length.
     albedo
         single-scattering albedo, one value a colour channel.
-    g
-        Henyey-Greenstein parameter.
+    phase
+        phase function (g1, g2, weight), see `deepclouds.medium.phase`.
     suns
         directional lights.
     environment
@@ -69,7 +70,7 @@ class CloudScene:
     volume: Volume
     scale: float
     albedo: tuple[float, ...]
-    g: float
+    phase: tuple[float, float, float]
     suns: tuple[Sun, ...]
     environment: Any
     surfaces: Any
@@ -101,8 +102,9 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     ------
     InputError
         for everything outside of what we render: more or less than one cloud, chromatic extinction, varying albedo, phase functions other
-        than `hg` and `isotropic`, emitters other than `directional`, `constant` and `envmap`, cameras other than `perspective`, crop
-        windows, path lengths other than -1 and 2, surfaces that let light through, media outside of the cloud, images without pixels.
+        than `hg`, `isotropic` and a `blendphase` of two of them, emitters other than `directional`, `constant` and `envmap`, cameras
+        other than `perspective`, crop windows, path lengths other than -1 and 2, surfaces that let light through, media outside of the
+        cloud, images without pixels.
     """
     notes: list[str] = []
     camera = _camera(scene, sensor, notes)
@@ -111,7 +113,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
         found = "no shape has an interior medium" if not containers else f"{len(containers)} shapes have an interior medium"
         raise InputError(f"{found}; deepclouds renders scenes with exactly one cloud: a shape with a null BSDF and a medium inside")
     _check_camera_medium(camera, containers[0])
-    volume, scale, albedo, g = _read_medium(containers[0])
+    volume, scale, albedo, phase = _read_medium(containers[0])
     suns, environment = read_lights(scene)
     integrator = scene.integrator()
     if max_depth is None:
@@ -119,7 +121,17 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     if hide_emitters is None:
         hide_emitters = bool(getattr(integrator, "hide_emitters", False))
     return CloudScene(
-        volume, scale, albedo, g, suns, environment, surfaces_alone(surfaces), camera, hide_emitters, check_depth(max_depth), tuple(notes)
+        volume,
+        scale,
+        albedo,
+        phase,
+        suns,
+        environment,
+        surfaces_alone(surfaces),
+        camera,
+        hide_emitters,
+        check_depth(max_depth),
+        tuple(notes),
     )
 
 
@@ -232,13 +244,13 @@ def read_lights(scene: Any) -> tuple[tuple[Sun, ...], Any]:
     return tuple(suns), environment
 
 
-def _read_medium(container: Any) -> tuple[Volume, float, tuple[float, ...], float]:
+def _read_medium(container: Any) -> tuple[Volume, float, tuple[float, ...], tuple[float, float, float]]:
     mi = mitsuba()
     medium = container.interior_medium()
     kind = medium.class_name()
     if kind not in ("HeterogeneousMedium", "HomogeneousMedium"):
         raise InputError(f"medium {kind}: deepclouds renders `heterogeneous` and `homogeneous` media")
-    g = _read_phase(medium.phase_function())
+    phase = _read_phase(medium.phase_function())
     parameters = mi.traverse(medium)
     scale = float(np.ravel(parameters["scale"])[0]) if "scale" in parameters else 1.0
     if "sigma_t.data" in parameters:
@@ -254,16 +266,33 @@ def _read_medium(container: Any) -> tuple[Volume, float, tuple[float, ...], floa
         _check_cover(container, volume)
     else:
         volume, scale = _homogeneous(container, medium)
-    return volume, scale, _read_albedo(medium, parameters, volume), g
+    return volume, scale, _read_albedo(medium, parameters, volume), phase
 
 
-def _read_phase(phase: Any) -> float:
+def _read_phase(phase: Any) -> tuple[float, float, float]:
+    """Lobes (g1, g2, weight of the first) of a Mitsuba phase function."""
     kind = phase.class_name()
-    if kind not in _PHASES:
-        raise InputError(f"phase function {kind}: deepclouds renders `hg` and `isotropic`")
-    if _PHASES[kind] == "isotropic":
-        return 0.0
-    return float(np.ravel(mitsuba().traverse(phase)["g"])[0])
+    parameters = mitsuba().traverse(phase)
+    if kind in _LOBES:
+        return _lobe(parameters, "g"), 0.0, 1.0
+    if kind != "BlendPhaseFunction":
+        raise InputError(f"phase function {kind}: deepclouds renders {_PHASE_NAMES}")
+    # Mitsuba tells what is nested in a blend in its description alone.
+    for nested in re.findall(r"nested_phase\[\d\] = (\w+)", str(phase)):
+        if nested not in _LOBES:
+            raise InputError(f"phase function {nested} in a blendphase: deepclouds renders {_PHASE_NAMES}")
+    if "weight.value.value" not in parameters:
+        raise InputError("a blendphase whose weight varies in space: deepclouds renders one phase function everywhere; give a number")
+    # Mitsuba's weight is that of the second phase function.
+    second = float(np.ravel(parameters["weight.value.value"])[0])
+    if not 0 <= second <= 1:
+        raise InputError(f"a blendphase with the weight {second:g}: weights lie in 0 to 1")
+    return _lobe(parameters, "phase_0.g"), _lobe(parameters, "phase_1.g"), 1 - second
+
+
+def _lobe(parameters: Any, name: str) -> float:
+    """Parameter g of a lobe; an isotropic one has none."""
+    return float(np.ravel(parameters[name])[0]) if name in parameters else 0.0
 
 
 def _coefficients(medium: Any, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import TAU_OPAQUE, distance_at, optical_depth
-from deepclouds.medium.phase import hg, rotate_to, sample_hg_cosine
+from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
 from deepclouds_runtime import stratified
 from deepclouds_runtime.lights import LightSource, Shade
 from deepclouds_runtime.scattering import MultipleScattering
@@ -52,15 +52,15 @@ class Cloud:
         extinction.
     albedo
         single-scattering albedo, one value a colour channel.
-    g
-        Henyey-Greenstein parameter.
+    phase
+        phase function (g1, g2, weight), see `deepclouds.medium.phase`.
     scattering
         source of J, or None for single scattering alone.
     """
 
     field: Field
     albedo: tuple[float, ...]
-    g: float
+    phase: tuple[float, float, float]
     scattering: MultipleScattering | None
 
 
@@ -187,7 +187,7 @@ def _scatter(
             different = tuple(sorted(set(cloud.albedo)))
             counts.queries += len(queries) * len(different)
             counts.skipped += (len(lanes) - len(queries)) * len(different)
-            j = cloud.scattering(take(points), take(w), take(omega), cloud.g, different, take(tau))
+            j = cloud.scattering(take(points), take(w), take(omega), cloud.phase, different, take(tau))
             for c in range(channel_count):
                 value = types.Float(np.ascontiguousarray(j[:, different.index(cloud.albedo[c])]))
                 value = value * (albedo[c] * albedo[c] * (0.25 / dr.pi)) * weight * take(radiance[c])
@@ -218,7 +218,7 @@ def single_scattering(
     types, medium = cloud.field.types, cloud.field
     channel_count, n = len(cloud.albedo), dr.width(points)
     albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
-    g = dr.opaque(types.Float, cloud.g)
+    lobes = [dr.opaque(types.Float, v) for v in cloud.phase]
     direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
     jitter = numbers.number(stratified.SHADOW)
     # A network is told the whole depth.
@@ -227,7 +227,7 @@ def single_scattering(
     def light(omega: Any, radiance: list[Any], share: Any) -> None:
         """One direction: `radiance` is what arrives over the density of the direction."""
         tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True), deepest)
-        single = hg(dr.dot(w, omega), g) * dr.exp(-tau) * share
+        single = two_lobe(dr.dot(w, omega), *lobes) * dr.exp(-tau) * share
         for c in range(channel_count):
             direct[c] += albedo[c] * radiance[c] * single
         if each is not None:
@@ -243,11 +243,11 @@ def single_scattering(
             numbers_of = functools.partial(numbers.number, part=k, parts=directions)
             omega, density = source.sample(numbers_of(stratified.LIGHT_U), numbers_of(stratified.LIGHT_V))
             radiance = [v / (density * directions) for v in source.arriving(points, omega, numbers)]
-            light(omega, radiance, density / (density + hg(dr.dot(w, omega), g)))
+            light(omega, radiance, density / (density + two_lobe(dr.dot(w, omega), *lobes)))
             # The other half of the pair: a direction from the phase function, for a strong peak that the source's table knows nothing of.
-            cosine = sample_hg_cosine(numbers_of(stratified.PHASE_U), g)
+            cosine = sample_two_lobe_cosine(numbers_of(stratified.PHASE_U), *lobes)
             omega = rotate_to(w, cosine, 2 * dr.pi * numbers_of(stratified.PHASE_V))
-            drawn = hg(cosine, g)
+            drawn = two_lobe(cosine, *lobes)
             tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True))
             share = drawn / (drawn + source.density(omega)) * (1.0 / directions) * dr.exp(-tau)
             for c, value in enumerate(source.arriving(points, omega, numbers)):

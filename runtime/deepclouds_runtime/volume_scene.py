@@ -20,6 +20,7 @@ _MARGIN = 1.15
 # Light and extinction beyond it come near float32's limit when they are multiplied.
 _LARGEST = 1e15
 _DEFAULT_OPTICAL_DEPTH = 60.0
+_DEFAULT_G = 0.85
 _DEFAULT_SUN = (100.0, 35.0)
 # Thinner voxels do not push the camera away: a haze around a cloud is no part of the picture's subject.
 _FRAMED = 0.01
@@ -38,7 +39,9 @@ class VolumeOptions:
     albedo
         single-scattering albedo: one value, or one for R, G and B.
     g
-        Henyey-Greenstein parameter.
+        Henyey-Greenstein parameter; 0.85 when `phase` is not given either.
+    phase
+        two Henyey-Greenstein lobes and the weight of the first, ``weight HG(g1) + (1 - weight) HG(g2)``; excludes `g`.
     sun
         azimuth and elevation of the sun. With ``up = "y"`` azimuth 0 is +Z and grows toward +X; with ``up = "z"`` it is +X and grows
         toward +Y. By default (100, 35), or no sun when `env` is given.
@@ -65,7 +68,8 @@ class VolumeOptions:
     optical_depth: float | None = None
     extinction: float | None = None
     albedo: tuple[float, ...] = (1.0,)
-    g: float = 0.85
+    g: float | None = None
+    phase: tuple[float, float, float] | None = None
     sun: tuple[float, float] | None = None
     irradiance: tuple[float, ...] = (12.0,)
     env: str | None = None
@@ -114,7 +118,7 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
         volume,
         scale,
         albedo,
-        options.g,
+        lobes(options),
         suns,
         environment,
         None,
@@ -159,7 +163,7 @@ def cloud_description(volume: Volume, options: VolumeOptions, source: str) -> di
         "albedo": {"type": "rgb", "value": list(_three(options.albedo))},
         "scale": extinction(volume, options, source),
         "sigma_t": {"type": "gridvolume", "grid": mi.VolumeGrid(np.ascontiguousarray(volume.density[..., None])), "to_world": unit},
-        "phase": {"type": "hg", "g": options.g},
+        "phase": _phase_description(lobes(options)),
     }
     container = {"type": "cube", "to_world": unit @ to_cube, "bsdf": {"type": "null"}, "interior": medium}
     return {
@@ -172,6 +176,19 @@ def cloud_description(volume: Volume, options: VolumeOptions, source: str) -> di
             "hide_emitters": options.hide_emitters,
         },
     }
+
+
+def lobes(options: VolumeOptions) -> tuple[float, float, float]:
+    """Phase function (g1, g2, weight) that the options ask for."""
+    if options.phase is not None:
+        return options.phase
+    return (_DEFAULT_G if options.g is None else options.g), 0.0, 1.0
+
+
+def _phase_description(phase: tuple[float, float, float]) -> dict[str, Any]:
+    first, second = ({"type": "hg", "g": g} for g in phase[:2])
+    # Mitsuba's weight is that of the second phase function.
+    return first if phase[2] == 1 else {"type": "blendphase", "weight": 1 - phase[2], "first": first, "second": second}
 
 
 def _three(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -190,8 +207,14 @@ def _check(options: VolumeOptions) -> None:
             refuse(name, f"give values of at most {_LARGEST:g}; larger ones overflow in the image")
     if max(options.albedo) > 1:
         refuse("albedo", "values lie in 0 to 1")
-    if not -1 < options.g < 1:
+    if options.g is not None and options.phase is not None:
+        raise InputError("g and phase are both given: each is the phase function; leave one out")
+    if options.g is not None and not -1 < options.g < 1:
         refuse("g", "give a value between -1 and 1, both excluded")
+    if options.phase is not None and not (
+        len(options.phase) == 3 and -1 < options.phase[0] < 1 and -1 < options.phase[1] < 1 and 0 <= options.phase[2] <= 1
+    ):
+        refuse("phase", "give g1 and g2 between -1 and 1, both excluded, and a weight of the first in 0 to 1")
     if options.up not in ("y", "z"):
         refuse("up", "choose 'y' or 'z'")
     for name in ("optical_depth", "extinction"):

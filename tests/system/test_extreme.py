@@ -131,7 +131,7 @@ def _render(mi: Any, case: Case) -> RenderResult:
         volume,
         case.optical_depth / line if line > 0 else 1.0,
         case.albedo,
-        case.g,
+        (case.g, 0.0, 1.0),
         suns,
         environment,
         surfaces_alone(list(scene.shapes())),

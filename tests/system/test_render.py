@@ -191,6 +191,12 @@ def test_every_different_albedo_is_asked_once(folder: Path) -> None:
     assert counts.queries == pytest.approx(result.counts.queries / 3, rel=1e-6)
 
 
+def test_two_lobes_reach_the_network(folder: Path) -> None:
+    network = Constant()
+    load(folder / "density.vol", predictor=network, phase=(0.8, -0.3, 0.7), size=(8, 8)).render(1)
+    assert np.all(np.concatenate(network.aux)[:, 1:4] == np.float32((0.8, -0.3, 0.7)))
+
+
 def test_a_constant_network_gives_the_known_radiance(folder: Path) -> None:
     """With j constant, J = albedo^2 E j / (4 pi) everywhere, and the indirect layer is opacity times it."""
     options: dict[str, Any] = {"sun": (30, 30), "irradiance": (3, 2, 1), "sky": 0.0, "albedo": (1, 0.9, 0.5), "size": (12, 12)}
@@ -241,6 +247,10 @@ def test_passes_do_not_show(folder: Path, monkeypatch: pytest.MonkeyPatch) -> No
         (["broken.xml"], "broken.xml"),
         (["text.txt"], "not '.txt'"),
         (["density.vol", "--g", "1"], "between -1 and 1"),
+        (["density.vol", "--g", "0.5", "--phase", "0.5,0,1"], "leave one out"),
+        (["density.vol", "--phase", "0.9,-1,0.5"], "phase = (0.9, -1.0, 0.5)"),
+        (["density.vol", "--phase", "0.9,0.1,1.5"], "weight of the first in 0 to 1"),
+        (["density.vol", "--phase", "nan,0.1,0.5"], "phase = (nan"),
         (["density.vol", "--albedo", "1.5"], "0 to 1"),
         (["density.vol", "--optical-depth", "-3"], "not negative"),
         (["density.vol", "--optical-depth", "nan"], "finite"),
@@ -299,7 +309,9 @@ def test_a_bad_output_is_refused_before_the_work(folder: Path, tmp_path: Path, o
         main([str(folder / "scene.xml"), "-o", str(tmp_path / out)])
 
 
-@pytest.mark.parametrize("text", [["--sun", "1"], ["--size", "20"], ["--spp", "0"], ["--seed", "-1"], ["--albedo", "1,2"]])
+@pytest.mark.parametrize(
+    "text", [["--sun", "1"], ["--size", "20"], ["--spp", "0"], ["--seed", "-1"], ["--albedo", "1,2"], ["--phase", "0.5,0"]]
+)
 def test_malformed_numbers_end_in_code_2(folder: Path, tmp_path: Path, text: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main([str(folder / "density.vol"), "-o", str(tmp_path / "a.exr"), *text])

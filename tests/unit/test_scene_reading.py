@@ -12,6 +12,7 @@ from deepclouds_runtime.placement import box_transform, cube_transform, locate, 
 from deepclouds_runtime.scene import check_depth, read_scene
 
 from deepclouds.errors import InputError
+from deepclouds.medium.phase import two_lobe_numpy
 
 FILM = '<film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/>{film}</film>'
 CAMERA = f'<sensor type="perspective">{FILM}</sensor>'
@@ -91,7 +92,7 @@ def test_the_grid_lies_where_mitsuba_has_it(mi: Any, folder: Path, name: str) ->
     assert np.quantile(error, 0.95) < 0.01
     assert read.scale == 5
     np.testing.assert_allclose(read.albedo, (0.9, 0.8, 0.7), rtol=1e-6)
-    assert read.g == pytest.approx(0.3)
+    assert read.phase == pytest.approx((0.3, 0, 1))
 
 
 def test_lights_camera_and_integrator(mi: Any, folder: Path) -> None:
@@ -133,6 +134,36 @@ def test_other_pixel_filters_are_noted(mi: Any, folder: Path) -> None:
     assert not read_scene(load(mi, folder, cloud())).notes
 
 
+BLEND = '<phase type="blendphase"><float name="weight" value="0.25"/>{0}{1}</phase>'
+LOBE = '<phase type="hg"><float name="g" value="{0}"/></phase>'
+ISOTROPIC = '<phase type="isotropic"/>'
+WEIGHTS = '<volume type="gridvolume" name="weight"><string name="filename" value="density.vol"/></volume>'
+
+
+@pytest.mark.parametrize(
+    ("phase", "lobes"),
+    [
+        (LOBE.format(0.3), (0.3, 0, 1)),
+        (ISOTROPIC, (0, 0, 1)),
+        (BLEND.format(LOBE.format(0.8), LOBE.format(-0.3)), (0.8, -0.3, 0.75)),
+        (BLEND.format(ISOTROPIC, LOBE.format(0.6)), (0, 0.6, 0.75)),
+        (BLEND.format(LOBE.format(0.6), ISOTROPIC), (0.6, 0, 0.75)),
+    ],
+)
+def test_phase_functions_are_those_of_mitsuba(mi: Any, folder: Path, phase: str, lobes: tuple[float, float, float]) -> None:
+    scene = load(mi, folder, cloud(phase=phase))
+    read = read_scene(scene)
+    assert read.phase == pytest.approx(lobes)
+    theirs = scene.shapes()[0].interior_medium().phase_function()
+    interaction = mi.MediumInteraction3f()
+    interaction.wi = mi.Vector3f(0, 0, -1)
+    interaction.sh_frame = mi.Frame3f(interaction.wi)
+    cosines = np.linspace(-0.99, 0.99, 12)
+    outgoing = mi.Vector3f(np.sqrt(1 - cosines**2), np.zeros(12), cosines)
+    value = np.array(theirs.eval_pdf(mi.PhaseFunctionContext(None), interaction, outgoing)[1])
+    np.testing.assert_allclose(two_lobe_numpy(cosines, *read.phase), np.broadcast_to(value, 12), rtol=2e-4)
+
+
 REFUSED = {
     "no cloud": (SUN, "no shape has an interior medium"),
     "two clouds": (cloud() + cloud('<translate x="5" y="0" z="0"/>'), "2 shapes have an interior medium"),
@@ -144,6 +175,16 @@ REFUSED = {
     "spot": (cloud() + '<emitter type="spot"/>', "SpotLight"),
     "rayleigh": (cloud(phase='<phase type="rayleigh"/>'), "phase function Rayleigh"),
     "tabphase": (cloud(phase='<phase type="tabphase"><string name="values" value="0.5, 1, 1.5"/></phase>'), "phase function Tab"),
+    "blend with rayleigh": (cloud(phase=BLEND.format(LOBE.format(0.8), '<phase type="rayleigh"/>')), "Rayleigh"),
+    "three lobes": (
+        cloud(phase=BLEND.format(LOBE.format(0.8), BLEND.format(ISOTROPIC, LOBE.format(0.1)))),
+        "BlendPhase in a blendphase",
+    ),
+    "blend that varies": (
+        cloud(phase=BLEND.replace('<float name="weight" value="0.25"/>', WEIGHTS).format(LOBE.format(0.8), LOBE.format(0.1))),
+        "weight varies",
+    ),
+    "blend beyond one": (cloud(phase=BLEND.replace("0.25", "1.25").format(LOBE.format(0.8), LOBE.format(0.1))), "the weight 1.25"),
     "grid of colours": (cloud().replace("density.vol", "colours.vol"), "chromatic extinction"),
     "medium outside a surface": (
         cloud() + '<shape type="sphere"><bsdf type="diffuse"/><medium type="homogeneous" name="exterior"/></shape>',
