@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from deepclouds.medium.majorants import BRICK, Majorants
 from deepclouds.volume import Volume
 
 # Stands for an infinite distance where a difference of two must stay a number.
@@ -25,9 +26,13 @@ class Field:
         the density and its place in the world.
     scale
         extinction per unit of density, 1 / world length; not negative.
+    brick
+        edge of a brick of `majorants`, in voxels; None for one brick, the whole box.
 
     Attributes
     ----------
+    majorants
+        local bounds of the extinction, for tracking and for skipping what is empty.
     majorant
         the largest extinction, 1 / world length.
     step
@@ -38,7 +43,7 @@ class Field:
     Lookups are exact trilinear interpolation between cell centres in float32; outside of the box extinction is zero.
     """
 
-    def __init__(self, types: ModuleType, volume: Volume, scale: float = 1.0) -> None:
+    def __init__(self, types: ModuleType, volume: Volume, scale: float = 1.0, brick: int | None = BRICK) -> None:
         if not (np.isfinite(scale) and scale >= 0):
             raise ValueError(f"scale must be finite and not negative, got {scale}")
         self.types = types
@@ -52,6 +57,7 @@ class Field:
         sigma = (grid.astype(np.float64) * scale).astype(np.float32)
         self.majorant = float(sigma.max())
         self.step = 0.5 * float(volume.voxel_size.min())
+        self.majorants = Majorants(types, sigma, np.linalg.norm(volume.to_world[:3, :3], axis=0) / np.array([nx, ny, nz]), brick)
         self._data = types.Float(np.ascontiguousarray(sigma).ravel())
         # Opaque, so that kernels compiled for one volume serve all others.
         self._stride_y, self._stride_z = dr.opaque(types.UInt32, nx), dr.opaque(types.UInt32, nx * ny)
@@ -74,10 +80,14 @@ class Field:
         """Extinction at world points `p`, 1 / world length; zero outside of the box and for inactive lanes."""
         return self.sigma_t_unit(self.to_unit(p), active)
 
+    def holds_unit(self, unit: Any) -> Any:
+        """Whether points, given in the unit cube of the box, lie in the box or on its faces."""
+        return (unit.x >= 0) & (unit.x <= 1) & (unit.y >= 0) & (unit.y <= 1) & (unit.z >= 0) & (unit.z <= 1)
+
     def sigma_t_unit(self, unit: Any, active: Any = True) -> Any:
         """Extinction at points given in the unit cube of the box."""
         t = self.types
-        inside = active & (unit.x >= 0) & (unit.x <= 1) & (unit.y >= 0) & (unit.y <= 1) & (unit.z >= 0) & (unit.z <= 1)
+        inside = active & self.holds_unit(unit)
         low, frac = [], []
         for value, n, last in zip(unit, self._samples, self._last, strict=True):
             cell = dr.clip(dr.fma(value, n, -0.5), 0.0, n - 1)

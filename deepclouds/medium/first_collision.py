@@ -1,4 +1,4 @@
-"""Where rays first collide: delta tracking with one majorant."""
+"""Where rays first collide: delta tracking with local majorants."""
 
 from __future__ import annotations
 
@@ -52,16 +52,15 @@ def first_collisions(
 @dr.syntax
 def _track(field: Field, origin: Any, direction: Any, rng: Any) -> tuple[Any, Any]:
     types = field.types
-    inverse_majorant = dr.opaque(types.Float, 1.0 / field.majorant)
-    majorant = dr.opaque(types.Float, field.majorant)
-    distance, leave = field.intersect(origin, direction)
-    base, along = field.to_unit(origin), field.direction_to_unit(direction)
-    going = leave > distance
-    hit = dr.zeros(types.Bool, dr.width(distance))
+    enter, leave = field.intersect(origin, direction)
+    start, along = dr.clip(field.to_unit(dr.fma(direction, enter, origin)), 0, 1), field.direction_to_unit(direction)
+    going = leave > enter
+    distance = dr.zeros(types.Float, dr.width(enter))
+    hit = dr.zeros(types.Bool, dr.width(enter))
     while going:
-        distance -= dr.log(1 - rng.next_float32()) * inverse_majorant
-        inside = distance < leave
-        sigma = field.sigma_t_unit(dr.fma(along, distance, base), inside)
-        hit = inside & (rng.next_float32() * majorant < sigma)
+        distance, tentative, majorant = field.majorants.step(start, along, distance, rng.next_float32(), going)
+        unit = dr.fma(along, distance, start)
+        inside = field.holds_unit(unit)
+        hit = inside & tentative & (rng.next_float32() * majorant < field.sigma_t_unit(unit, inside & tentative))
         going = inside & ~hit
-    return distance, hit
+    return enter + distance, hit

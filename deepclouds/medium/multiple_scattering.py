@@ -65,7 +65,8 @@ def trace_walks(
 
     Notes
     -----
-    One global majorant. The roulette of a connection sees the walk's past only. Shadow rays are delta tracked (0 or 1).
+    Majorants are local (`deepclouds.medium.majorants`). Shadow rays are delta tracked (0 or 1). The roulette of a connection sees
+    the walk's past only.
     Source: Woodcock et al. 1965; Novak et al. 2018 (CGF 37(2), sections 5 and 6).
     """
     n, k_suns, m_albedos = len(points), suns.shape[1], albedos.shape[1]
@@ -132,8 +133,6 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
     types = field.types
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     k_suns, m_albedos = len(queries.suns), len(queries.albedos)
-    majorant = dr.opaque(Float, field.majorant)
-    inverse_majorant = dr.opaque(Float, 1.0 / field.majorant)
     walks_each = dr.opaque(UInt32, walks)
     limit = dr.opaque(UInt32, total)
     connect_4pi = dr.opaque(Float, 4.0 * np.pi * connect)
@@ -151,15 +150,10 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
     suns = [dr.zeros(Array3f, lanes) for _ in range(k_suns)]
     albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
-    sums = [dr.zeros(Float, lanes) for _ in range(k_suns * m_albedos)]
 
     while alive:
         if ended:
-            # Hand in the finished walk, take the next one; a lane retires when none is left.
-            finished = number != 0xFFFFFFFF
-            for i in range(k_suns * m_albedos):
-                dr.scatter(result, sums[i], number * (k_suns * m_albedos) + i, finished)
-                sums[i] = Float(0)
+            # Take the next walk; a lane retires when none is left.
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
             point = number // walks_each
@@ -172,9 +166,9 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
             direction = rotate_to(incoming, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
             origin = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.points))
             enter, leave = field.intersect(origin, direction)
-            position = field.to_unit(origin)
-            # A ray that misses the box starts beyond it, and so escapes at its first step.
-            distance = dr.select(leave > enter, enter, 1e32)
+            # A ray that misses the box starts far beyond it, and so escapes at its first step.
+            position = dr.clip(field.to_unit(dr.fma(direction, enter, origin)), 0, 1)
+            distance = dr.select(leave > enter, 0, 1e32)
             for k in range(k_suns):
                 suns[k] = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.suns[k]))
             for m in range(m_albedos):
@@ -192,19 +186,20 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
 
         rng, u_step = _uniform(types, rng)
         rng, u_event = _uniform(types, rng)
-        distance -= dr.log(1 - u_step) * inverse_majorant
-        unit = dr.fma(field.direction_to_unit(heading), distance, position)
-        inside = (unit.x >= 0) & (unit.x <= 1) & (unit.y >= 0) & (unit.y <= 1) & (unit.z >= 0) & (unit.z <= 1) & alive
-        sigma = field.sigma_t_unit(unit, inside)
-        hit = inside & (u_event * majorant < sigma)
+        along = field.direction_to_unit(heading)
+        distance, tentative, majorant = field.majorants.step(position, along, distance, u_step, alive)
+        unit = dr.fma(along, distance, position)
+        inside = alive & field.holds_unit(unit)
+        sigma = field.sigma_t_unit(unit, inside & tentative)
+        hit = inside & tentative & (u_event * majorant < sigma)
 
         collision = hit & ~shadow
         connected = shadow & ~inside
         value = dr.select(connected, dr.maximum(4 * np.pi * _phase(lobes, dr.dot(direction, sun)), least), 0)
-        for k in range(k_suns):
-            mine = connected & (lowest == (1 << k))
-            for m in range(m_albedos):
-                sums[k * m_albedos + m] += dr.select(mine, value * weight[m], 0)
+        # A walk's results are its lane's alone.
+        first = (number * k_suns + dr.popcnt(lowest - 1)) * m_albedos
+        for m in range(m_albedos):
+            dr.scatter_add(result, value * weight[m], first + m, connected, mode=dr.ReduceMode.NoConflicts)
         pending = dr.select(connected | (shadow & hit), pending & ~lowest, pending)
 
         # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connections.

@@ -233,6 +233,31 @@ def test_lobes_of_one_kind_are_one_lobe() -> None:
         assert np.abs(difference / np.sqrt(variance)).max() < stats.norm.isf(1e-3 / 2 / difference.size)
 
 
+def patches(brick: int | None) -> Field:
+    """Separate dense lumps in a turned box that is mostly empty: many bricks of different majorants."""
+    noise = ndimage.gaussian_filter(np.random.default_rng(58).normal(size=(24, 30, 36)), 2.0, mode="wrap")
+    to_world = np.eye(4)
+    to_world[:3, :3] = rotation(59) @ np.diag([1.3, 1.0, 0.8])
+    volume = Volume(np.clip(noise - np.quantile(noise, 0.7), 0, None), to_world)
+    return Field(backend(), volume, 6.0 / float(volume.density.mean()), brick=brick)
+
+
+@pytest.mark.parametrize("phase", [0.0, TWO_LOBES])
+def test_local_majorants_change_no_mean(phase: Phase) -> None:
+    """Labels with bricks of two sizes against the readable twin, one majorant for the whole box: each point, and over all."""
+    walks, sets = 12_000, []
+    for brick, seed in ((None, 60), (4, 61), (2, 62)):
+        field = patches(brick)
+        points, w, suns = inside(field, 60, 63, margin=0.1), sphere(60, 64), sphere(1, 65)
+        j = trace(field, points, w, phase, suns, [1.0], walks, seed=seed)[..., 0].astype(np.float64)
+        sets.append((j.mean(axis=1), j.var(axis=1) / walks))
+    for mean, variance in sets[1:]:
+        difference, both = mean - sets[0][0], variance + sets[0][1]
+        assert np.sqrt(both.sum()) / mean.sum() < 0.02
+        assert abs(difference.sum()) < 4 * np.sqrt(both.sum())
+        assert np.abs(difference / np.sqrt(both)).max() < stats.norm.isf(1e-3 / 2 / difference.size)
+
+
 def test_lanes_change_nothing() -> None:
     field = cloud()
     points, w, suns = inside(field, 40, 25, margin=0.2), sphere(40, 26), sphere(4, 27)
