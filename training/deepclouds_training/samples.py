@@ -138,21 +138,36 @@ class SampleSource:
     ) -> Samples:
         """Random queries of one shard, stencils built with the shard's own unit of length times `unit_factor`; into `out` if given."""
         shard, field = self._load(info)
-        descriptor = Descriptor(field, unit=unit_factor * default_unit(field))
         i = rng.integers(0, len(shard.point), queries)
         k = rng.integers(0, shard.omega_sun.shape[1], queries)
         m = rng.integers(0, shard.albedo.shape[1], queries)
         azimuth = rng.uniform(0.0, 2 * np.pi, queries)
-        w, sun = shard.w[i], shard.omega_sun[i, k]
         side = np.where(rng.random(queries) < 0.5, -1.0, 1.0) if mirror else None
-        stencil = descriptor.stencils_numpy(shard.point[i], w, sun, azimuth, side, out)
+        descriptor = Descriptor(field, unit=unit_factor * default_unit(field))
+        return self._samples(
+            info, shard, (i, k, m), descriptor.stencils_numpy(shard.point[i], shard.w[i], shard.omega_sun[i, k], azimuth, side, out)
+        )
+
+    def all_of(self, info: ShardInfo) -> tuple[Samples, float]:
+        """Every label of one shard, in the order point, sun, albedo, in the shard's own unit of length; and its longest side in that unit."""
+        shard, field = self._load(info)
+        i, k, m = (v.ravel() for v in np.indices(shard.error.shape))
+        descriptor = Descriptor(field)
+        stencil = descriptor.stencils_numpy(shard.point[i], shard.w[i], shard.omega_sun[i, k])
+        longest = float(np.linalg.norm(shard.volume.to_world[:3, :3], axis=0).max())
+        return self._samples(info, shard, (i, k, m), stencil), longest / descriptor.unit
+
+    def _samples(self, info: ShardInfo, shard: Shard, chosen: tuple[NDArray[np.int64], ...], stencil: NDArray[np.float32]) -> Samples:
+        """The labels at the `chosen` points, suns and albedos of a shard, with their stencils."""
+        i, k, m = chosen
+        w, sun = shard.w[i], shard.omega_sun[i, k]
         aux = aux_inputs(angle_between(w, sun), *shard.phase[i].T, shard.albedo[i, m], shard.tau_sun[i, k])
         half, error = shard.half[i, k, m], shard.error[i, k, m]
         label = half.mean(axis=-1)
         if not (np.all(np.isfinite(label)) and np.all(np.isfinite(error)) and np.all(np.isfinite(stencil))):
             path = self.dataset.folder / info.file
             raise InputError(f"{path}: labels or stencils are not finite; delete the shard and generate it again")
-        return Samples(stencil, aux, label, error, half, np.full(queries, info.index, np.int64))
+        return Samples(stencil, aux, label, error, half, np.full(len(i), info.index, np.int64))
 
     def _turn(self, position: int) -> tuple[int, int]:
         """Shard number and visit at a position of the endless sequence that visits all shards in a new random order each time."""
