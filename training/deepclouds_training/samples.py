@@ -149,7 +149,7 @@ class SampleSource:
         )
 
     def all_of(self, info: ShardInfo) -> tuple[Samples, float]:
-        """Every label of one shard, in the order point, sun, albedo, in the shard's own unit of length; and its longest side in that unit."""
+        """Every label of one shard, in the order point, sun, albedo, and the longest side of its box in units of length."""
         shard, field = self._load(info)
         i, k, m = (v.ravel() for v in np.indices(shard.error.shape))
         descriptor = Descriptor(field)
