@@ -1,4 +1,4 @@
-"""The convective cloud body that cumulus, its fields and congestus share: budding balls, billows, erosion, a flat base."""
+"""The convective cloud body that the heaped families share: budding balls, billows, erosion, a flat base."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from deepclouds_training.clouds._noise import Array, CellNoise, SmoothNoise, smoothstep
 from deepclouds_training.clouds._parameters import CloudParameters, Streams, number
+from deepclouds_training.clouds._parcel import condensation, entrainment
 from deepclouds_training.clouds._raster import Field, Grid
 from deepclouds_training.clouds._turrets import Balls, distance, extent
 
@@ -22,14 +23,24 @@ class HeapParameters(CloudParameters):
     mean_to_max: float = number(0.3, 0.75, "extinction-weighted mean density over the maximum")
 
 
-def heap(balls: Balls, parameters: HeapParameters, streams: Streams, turret: float, base: float) -> Field:
-    """Density around `balls` above the height `base`; `turret` is the radius of a typical turret, the unit of all lengths here."""
+def heap(balls: Balls, parameters: HeapParameters, streams: Streams, turret: float, foot: float = 0.3, lid: float = np.inf) -> Field:
+    """Density around `balls` above the condensation level y = 0.
+
+    Parameters
+    ----------
+    turret
+        radius of a typical turret, the unit of all lengths here.
+    foot
+        extinction at the base over that at the top of an undiluted parcel; 1 for smoke, which does not condense.
+    lid
+        height above which the extinction grows no more; by default it grows to the top of the cloud.
+    """
     knobs = CellNoise.draw(streams("knobs"))
     ragged = SmoothNoise.draw(streams("ragged"))
     bulge = 0.42 * turret * parameters.billow
     lower, upper = extent(balls, bulge + 0.05 * turret)
-    lower[1] = base - 0.12 * turret
-    top = float(upper[1])
+    lower[1] = -0.12 * turret
+    top = min(float(upper[1]), lid)
 
     def evaluate(grid: Grid) -> Array:
         depth = -distance(grid, balls, 1.3 * bulge + 0.1 * turret)
@@ -39,12 +50,9 @@ def heap(balls: Balls, parameters: HeapParameters, streams: Streams, turret: flo
         depth -= np.float32(0.2 * turret * parameters.erosion) * np.maximum(noise, 0)
         y = grid.open()[1]
         # The condensation level: flat but for a few per cent, and firmer than the sides.
-        above = y - np.float32(base) + np.float32(0.03 * turret) * noise
-        depth = np.minimum(depth, 1.5 * above)
+        depth = np.minimum(depth, 1.5 * (y + np.float32(0.03 * turret) * noise))
         edge = smoothstep(0.0, parameters.softness * turret, depth)
-        # Liquid water grows with height above the base; mixing with dry air thins the outer shell.
-        wetness = np.float32(0.35) + np.float32(0.65) * np.sqrt(np.clip((y - base) / np.float32(top - base), 0, 1))
-        core = np.float32(0.45) + np.float32(0.55) * smoothstep(0.0, 0.8 * turret, depth)
-        return np.asarray(edge * wetness * core * np.exp(np.float32(0.22) * noise), np.float32)
+        inside = condensation(y / np.float32(top), foot) * entrainment(depth, 0.8 * turret)
+        return np.asarray(edge * inside * np.exp(np.float32(0.22) * noise), np.float32)
 
     return Field(tuple(lower), tuple(upper), evaluate, mean_to_max=parameters.mean_to_max)

@@ -9,7 +9,20 @@ from typing import Any
 
 from deepclouds.errors import InputError
 from deepclouds.volume import Volume
-from deepclouds_training.clouds import congestus, cumulus, cumulus_field, fractus, plume, shapes, stratus
+from deepclouds_training.clouds import (
+    altocumulus,
+    cirrus,
+    congestus,
+    cumulonimbus,
+    cumulus,
+    cumulus_field,
+    fractus,
+    plume,
+    pyro,
+    shapes,
+    stratocumulus,
+    stratus,
+)
 from deepclouds_training.clouds._parameters import Choice, CloudParameters, Range, domains, named_streams, resolve
 from deepclouds_training.clouds._raster import Field, rasterise
 
@@ -30,12 +43,15 @@ class Family:
         frozen dataclass of its parameters; `ranges` gives their domains.
     build
         from parameters and named random streams to a density over space.
+    optical_depth
+        of a thick column of such a cloud, vertically: what previews show.
     """
 
     name: str
     summary: str
     parameters: type[CloudParameters]
     build: Callable[[Any, Callable[[str], Any]], Field]
+    optical_depth: float
 
     @property
     def ranges(self) -> dict[str, Range | Choice]:
@@ -44,13 +60,24 @@ class Family:
 
 
 _ALL = (
-    Family("cumulus", "a heap with a flat base and a cauliflower top", cumulus.CumulusParameters, cumulus.build),
-    Family("stratus", "a layer, closed or broken, its sides cut by the box or fading", stratus.StratusParameters, stratus.build),
-    Family("congestus", "a tall tower of rising bulbs, without an anvil", congestus.CongestusParameters, congestus.build),
-    Family("fractus", "wind-torn shreds with strong contrast of density", fractus.FractusParameters, fractus.build),
-    Family("cumulus_field", "several separate cumuli on one base level", cumulus_field.CumulusFieldParameters, cumulus_field.build),
-    Family("plume", "buoyant smoke that rolls up into swirls", plume.PlumeParameters, plume.build),
-    Family("shapes", "simple shapes, homogeneous or graded, hard or soft", shapes.ShapesParameters, shapes.build),
+    Family("cumulus", "a heap with a flat base and a cauliflower top, humilis to mediocris", cumulus.CumulusParameters, cumulus.build, 25),
+    Family("cumulus_field", "many separate cumuli on one base level", cumulus_field.CumulusFieldParameters, cumulus_field.build, 15),
+    Family("congestus", "a tall tower of rising bulbs, without an anvil", congestus.CongestusParameters, congestus.build, 60),
+    Family("cumulonimbus", "a deep tower under an anvil", cumulonimbus.CumulonimbusParameters, cumulonimbus.build, 100),
+    Family("stratus", "an even layer, closed or nearly so", stratus.StratusParameters, stratus.build, 10),
+    Family(
+        "stratocumulus",
+        "a deck of closed cells with gaps, of open cells or of rolls",
+        stratocumulus.StratocumulusParameters,
+        stratocumulus.build,
+        14,
+    ),
+    Family("altocumulus", "a sheet of many small rounded elements, often in rows", altocumulus.AltocumulusParameters, altocumulus.build, 8),
+    Family("cirrus", "ice drawn out by the wind into long fibres", cirrus.CirrusParameters, cirrus.build, 1.5),
+    Family("fractus", "wind-torn shreds with strong contrast of density", fractus.FractusParameters, fractus.build, 6),
+    Family("pyro", "the rolling cloud of a fire or an explosion", pyro.PyroParameters, pyro.build, 50),
+    Family("plume", "buoyant smoke that rolls up into swirls", plume.PlumeParameters, plume.build, 20),
+    Family("shapes", "simple shapes, homogeneous or graded, hard or soft", shapes.ShapesParameters, shapes.build, 25),
 )
 FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
 HELD_OUT: tuple[str, ...] = ("congestus", "plume")

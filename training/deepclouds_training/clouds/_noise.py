@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from deepclouds_training.clouds._raster import Grid
 
@@ -40,7 +41,8 @@ def _scatter(taps: list[tuple[NDArray[np.int64], NDArray[np.float64]]], n: int) 
 
 def _separable(lattice: Array, wx: Array, wy: Array, wz: Array) -> Array:
     """Interpolate a lattice (m, m, m) with weights along x, y, z: array (nz, ny, nx)."""
-    out = np.matmul(wy, lattice @ wx.T)
+    # Along y first: sheets have a single row there.
+    out = np.matmul(wy, lattice) @ wx.T
     return np.asarray((wz @ out.reshape(len(lattice), -1)).reshape(len(wz), len(wy), len(wx)), np.float32)
 
 
@@ -122,6 +124,37 @@ class CellNoise:
             total += np.float32(gain**k) * (1 - _separable(self.texture, *w))
             weight += gain**k
         return total / np.float32(weight)
+
+
+@dataclass(frozen=True)
+class CellSheet:
+    """Cells in a plane around jittered points (Worley 1996), without a period; 1 unit of length holds `frequency` of them."""
+
+    tree: cKDTree
+    frequency: float
+
+    @staticmethod
+    def draw(rng: np.random.Generator, frequency: float, jitter: float = 1.0, reach: float = 0.9) -> CellSheet:
+        """Draw the points of the square from -`reach` to `reach`: one a cell, moved from its middle by at most half of `jitter`."""
+        n = int(np.ceil(reach * frequency)) + 2
+        lattice = np.stack(np.meshgrid(np.arange(-n, n), np.arange(-n, n), indexing="ij"), axis=-1).reshape(-1, 2)
+        # Every second row is shifted by half a cell: convection prefers hexagons to squares.
+        points = lattice + 0.5 + jitter * (rng.random(lattice.shape) - 0.5)
+        points[:, 0] += 0.5 * (lattice[:, 1] % 2)
+        return CellSheet(cKDTree(points), frequency)
+
+    def _distances(self, x: Array, z: Array, count: int) -> NDArray[np.float64]:
+        at = np.stack(np.broadcast_arrays(x, z), axis=-1).astype(np.float64) * self.frequency
+        return np.asarray(self.tree.query(at, k=count)[0])
+
+    def nearest(self, x: Array, z: Array) -> Array:
+        """Distance to the nearest point in units of a cell, at positions x, z that broadcast."""
+        return np.asarray(self._distances(x, z, 1), np.float32)
+
+    def wall(self, x: Array, z: Array) -> Array:
+        """Distance from the walls between cells, with mean about 0 and deviation about 1: about -1.3 on a wall."""
+        near = self._distances(x, z, 2)
+        return np.asarray((near[..., 1] - near[..., 0] - 0.33) / 0.25, np.float32)
 
 
 @dataclass(frozen=True)

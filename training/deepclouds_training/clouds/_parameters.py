@@ -45,10 +45,11 @@ class Range:
         common, u = rng.random(2)
         if self.usual is not None and common < self.usual_share:
             value = self.usual
-        elif self.integer:
-            value = min(math.floor(self.low + u * (self.high - self.low + 1)), self.high)
         elif self.log:
             value = self.low * (self.high / self.low) ** u
+            value = math.floor(value + 0.5) if self.integer else value
+        elif self.integer:
+            value = min(math.floor(self.low + u * (self.high - self.low + 1)), self.high)
         else:
             value = self.low + u * (self.high - self.low)
         value = min(max(value, self.low), self.high)

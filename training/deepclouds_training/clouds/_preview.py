@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,21 @@ from scipy.ndimage import map_coordinates, zoom
 
 from deepclouds.volume import Volume
 
-_VIEW = (0.25, 0.28, 1.0)
+# Directions toward the eye. Straight up the world's Y cannot be the picture's up, so the view from the top leans by a millionth.
+VIEWS = {"side": (0.25, 0.28, 1.0), "top": (0.0, 1.0, 1e-6)}
 _SUN = (-0.75, 0.8, 0.75)
-_SKY_TOP, _SKY_LOW = np.array([0.24, 0.40, 0.66]), np.array([0.62, 0.74, 0.86])
+# Linear colours behind a cloud, at the picture's top and bottom.
+_BEHIND = {"side": (np.array([0.24, 0.40, 0.66]), np.array([0.62, 0.74, 0.86])), "top": (np.array([0.03, 0.08, 0.14]),) * 2}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a contact sheet: a title, labelled volumes, the optical depth of their thick columns and a view, "side" or "top"."""
+
+    title: str
+    clouds: Sequence[tuple[str, Volume]]
+    optical_depth: float
+    view: str = "side"
 
 
 def _frame(toward: Sequence[float]) -> NDArray[np.float64]:
@@ -42,8 +55,8 @@ def _resample(volume: Volume, frame: NDArray[np.float64], lattice: NDArray[np.fl
     return np.asarray(np.where(inside, values, 0), np.float32)
 
 
-def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps: int = 128) -> NDArray[np.uint8]:
-    """Render a volume of white scatterers against a sky.
+def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps: int = 128, view: str = "side") -> NDArray[np.uint8]:
+    """Render a volume of white scatterers against a sky, or from above against the sea.
 
     Single scattering with shadows toward a sun high on the left, two softened copies of it that stand for the light scattered on,
     and an ambient term that darkens with depth below the sky; no phase function.
@@ -51,11 +64,13 @@ def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps:
     Parameters
     ----------
     optical_depth
-        of a ray through the world's length 2 at the extinction-weighted mean density.
+        of a thick column: nine in ten of the vertical columns that hold any cloud are thinner.
     size
         pixels along both sides; the picture just holds the box.
     steps
         samples along each ray.
+    view
+        "side" or "top".
 
     Returns
     -------
@@ -63,9 +78,9 @@ def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps:
     """
     lower, upper = volume.bounds
     reach = float(np.linalg.norm(upper - lower) / 2)
-    flat = volume.density.astype(np.float64)
-    sigma = optical_depth / 2 * flat.sum() / (flat**2).sum()
-    camera, sun, zenith = _frame(_VIEW), _frame(_SUN), _frame((1e-6, 1.0, 1e-6))
+    columns = volume.density.sum(axis=1, dtype=np.float64) * volume.voxel_size[1]
+    sigma = optical_depth / float(np.quantile(columns[columns > 0], 0.9))
+    camera, sun, zenith = _frame(VIEWS[view]), _frame(_SUN), _frame((1e-6, 1.0, 1e-6))
     corners = np.array([[x, y, z] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])])
     side = 1.04 * float(np.abs(corners @ camera[:2].T).max())
     seen_at = _lattice(reach, side, steps)
@@ -73,7 +88,7 @@ def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps:
     h = 2 * reach / steps
     toward_sun = _depth_toward(volume, sun, reach, 112, camera, seen_at) * sigma
     toward_sky = _depth_toward(volume, zenith, reach, 64, camera, seen_at) * sigma
-    light = 0.55 * np.exp(-toward_sun) + 0.2 * np.exp(-0.2 * toward_sun) + 0.08 * np.exp(-0.04 * toward_sun)
+    light = 0.48 * np.exp(-toward_sun) + 0.2 * np.exp(-0.2 * toward_sun) + 0.08 * np.exp(-0.04 * toward_sun)
     ambient = 0.13 * np.exp(-0.15 * toward_sky) + 0.05
     # The lattice's first axis points toward the eye, so the march starts at its far end.
     tau = density[::-1] * np.float32(sigma * h)
@@ -83,7 +98,8 @@ def preview(volume: Volume, optical_depth: float = 25.0, size: int = 160, steps:
     seen = (weight[..., None] * colour).sum(axis=0)
     behind = np.exp(-tau.sum(axis=0))[..., None]
     height = np.linspace(0, 1, steps)[:, None, None]
-    picture = seen + behind * (_SKY_LOW * (1 - height) + _SKY_TOP * height)
+    top, low = _BEHIND[view]
+    picture = seen + behind * (low * (1 - height) + top * height)
     picture = np.clip(picture, 0, 1)[::-1] ** (1 / 2.2)
     finer = zoom(picture, (size / steps, size / steps, 1), order=1, grid_mode=True, mode="nearest")
     return np.asarray(np.rint(finer * 255), np.uint8)
@@ -97,25 +113,25 @@ def _depth_toward(
     spacing = 2 * reach / n
     column = (np.cumsum(density[::-1], axis=0)[::-1] - 0.5 * density) * np.float32(spacing)
     there = np.tensordot((frame @ camera.T).astype(np.float32), lattice, axes=1)
-    # A step toward the light, so that the lattice's own steps do not shadow a surface.
-    there[2] += np.float32(spacing)
+    # A step and a half toward the light, so that the lattice's own steps do not shadow a surface.
+    there[2] += np.float32(1.5 * spacing)
     cells = ((there / np.float32(reach) + 1) * np.float32(n / 2) - np.float32(0.5))[::-1]
     return np.asarray(map_coordinates(column, cells, order=1, mode="nearest"), np.float32)
 
 
-def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, Volume]]]], size: int = 160) -> NDArray[np.uint8]:
-    """Previews in labelled rows: each row a title and its (label, volume) pairs; returns an image (height, width, 3), uint8."""
+def contact_sheet(rows: Sequence[Row], size: int = 160) -> NDArray[np.uint8]:
+    """Previews in labelled rows: an image (height, width, 3), uint8."""
     from PIL import Image, ImageDraw, ImageFont
 
-    columns = max(len(row) for _, row in rows)
+    columns = max(len(row.clouds) for row in rows)
     heading, gap = 18, 4
     sheet = Image.new("RGB", (columns * (size + gap) + gap, len(rows) * (size + heading + gap) + gap), (250, 250, 250))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
-    for k, (title, row) in enumerate(rows):
+    for k, row in enumerate(rows):
         top = gap + k * (size + heading + gap)
-        draw.text((gap + 2, top), title, fill=(20, 20, 20), font=font)
-        for i, (label, volume) in enumerate(row):
+        draw.text((gap + 2, top), row.title, fill=(20, 20, 20), font=font)
+        for i, (label, volume) in enumerate(row.clouds):
             left = gap + i * (size + gap)
-            sheet.paste(Image.fromarray(preview(volume, size=size)), (left, top + heading))
+            sheet.paste(Image.fromarray(preview(volume, row.optical_depth, size, view=row.view)), (left, top + heading))
             draw.text((left + 4, top + heading + 2), label, fill=(255, 255, 255), font=font)
     return np.asarray(sheet)

@@ -16,8 +16,6 @@ _FLOOR = 2e-3
 _SCOUT = 56
 # Grids coarser than this are averaged down from finer ones.
 _FINE_ENOUGH = 48
-# Fewer voxels than this are not a cloud.
-_FEWEST = 8
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,10 @@ class Field:
         for x, y and z: whether the cloud is meant to reach the faces of the box (no crop, no empty margin there).
     mean_to_max
         extinction-weighted mean density over its maximum to aim at by raising the density to a power; None leaves it as it is.
+    fewest
+        voxels that are not empty below which the field counts as empty.
+    averaged
+        whether coarse grids average over finer samples; False for bodies that are defined by the voxels themselves.
     """
 
     lower: tuple[float, float, float]
@@ -67,6 +69,8 @@ class Field:
     evaluate: Callable[[Grid], NDArray[np.float32]]
     cut: tuple[bool, bool, bool] = (False, False, False)
     mean_to_max: float | None = None
+    fewest: int = 8
+    averaged: bool = True
 
 
 def weighted_mean(density: NDArray[np.float32]) -> float:
@@ -86,7 +90,7 @@ def rasterise(field: Field, resolution: int, voxel_aspect: float) -> Volume | No
     cut = np.array(field.cut)
     if not cut.all():
         scout = Grid.over(lower, upper, _counts(upper - lower, np.ones(3), _SCOUT))
-        density = _sharpen(field.evaluate(scout), field.mean_to_max)
+        density = _sharpen(field.evaluate(scout), field)
         if density is None:
             return None
         for axis in np.flatnonzero(~cut):
@@ -101,7 +105,7 @@ def rasterise(field: Field, resolution: int, voxel_aspect: float) -> Volume | No
     # Axes that are cut keep their exact extent; the others keep the voxel's shape and grow their margin by what rounding leaves.
     middle, half = (lower + upper) / 2, np.where(cut, (upper - lower) / 2, counts * h * shape / 2)
     # A coarse grid could step over thin layers and shreds: its voxels are averages over finer samples instead.
-    finer = 1 if cut.all() else -(-_FINE_ENOUGH // resolution)
+    finer = 1 if cut.all() or not field.averaged else -(-_FINE_ENOUGH // resolution)
     values = field.evaluate(Grid.over(middle - half, middle + half, counts * finer)).astype(np.float32)
     if finer > 1:
         nx, ny, nz = counts
@@ -110,7 +114,7 @@ def rasterise(field: Field, resolution: int, voxel_aspect: float) -> Volume | No
         faces = np.moveaxis(values, 2 - axis, 0)
         faces[0] = 0
         faces[-1] = 0
-    density = _sharpen(values, field.mean_to_max)
+    density = _sharpen(values, field)
     if density is None:
         return None
     half = half / half.max()
@@ -123,16 +127,16 @@ def _counts(sides: NDArray[np.float64], shape: NDArray[np.float64], resolution: 
     return counts
 
 
-def _sharpen(values: NDArray[np.float32], target: float | None) -> NDArray[np.float32] | None:
-    """Scale the maximum to 1, raise to the power that meets the target, drop what is below the floor; None when nothing is left."""
+def _sharpen(values: NDArray[np.float32], field: Field) -> NDArray[np.float32] | None:
+    """Scale the maximum to 1, raise to the power that meets the field's mean, drop what is below the floor; None for too little."""
     top = float(values.max(initial=0.0))
     if not np.isfinite(top) or top <= 0:
         return None
     density = np.asarray(values / np.float32(top), np.float32)
-    if target is not None:
-        density = density ** np.float32(_power(density, target))
+    if field.mean_to_max is not None:
+        density = density ** np.float32(_power(density, field.mean_to_max))
     density[density < _FLOOR] = 0
-    return density if np.count_nonzero(density) >= _FEWEST else None
+    return density if np.count_nonzero(density) >= field.fewest else None
 
 
 def _power(density: NDArray[np.float32], target: float) -> float:

@@ -8,13 +8,17 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deepclouds.errors import InputError
 from deepclouds_training.clouds._make import FAMILIES, HELD_OUT, draw_parameters, find_family, make_cloud
 from deepclouds_training.clouds._parameters import Choice, meanings
-from deepclouds_training.clouds._raster import weighted_mean
+from deepclouds_training.clouds._statistics import CloudStatistics, measure
+
+if TYPE_CHECKING:
+    from deepclouds_training.clouds._preview import Row
 
 
 def main(argv: Sequence[str], prog: str) -> int:
@@ -28,6 +32,7 @@ def main(argv: Sequence[str], prog: str) -> int:
     parser = argparse.ArgumentParser(prog=prog, description="Procedural clouds to train on and to try.")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     show = verbs.add_parser("list", help="families, their parameters and ranges")
+    show.add_argument("families", nargs="*", metavar="FAMILY", help="default: all")
     show.add_argument("--statistics", type=int, default=0, metavar="COUNT", help="also measure COUNT clouds of each family")
     make = verbs.add_parser("make", help="write one cloud: density.vdb, density.vol, scene.xml and cloud.json")
     make.add_argument("family", metavar="FAMILY")
@@ -37,9 +42,9 @@ def main(argv: Sequence[str], prog: str) -> int:
     make.add_argument("--albedo", type=float, nargs="+", default=[1.0], help="one value or three (default: 1)")
     make.add_argument("--g", type=float, default=0.85, help="of the Henyey-Greenstein phase function (default: 0.85)")
     make.add_argument("--sun", type=float, nargs=3, default=[0.4, 0.7, 1.0], metavar=("X", "Y", "Z"), help="direction toward the sun")
-    sheet = verbs.add_parser("preview", help="a contact sheet, a row a family")
+    sheet = verbs.add_parser("preview", help="contact sheets: one with a row a family, or one a family from the side and above")
     sheet.add_argument("families", nargs="*", metavar="FAMILY", help="default: all")
-    sheet.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
+    sheet.add_argument("-o", "--output", type=Path, required=True, metavar="PNG|DIR", help="a picture, or a folder for a picture a family")
     sheet.add_argument("--count", type=int, default=5, help="clouds of each family (default: 5)")
     sheet.add_argument("--size", type=int, default=200, help="pixels along a picture (default: 200)")
     for sub, resolution in ((make, 128), (sheet, 128), (show, 64)):
@@ -47,7 +52,7 @@ def main(argv: Sequence[str], prog: str) -> int:
         sub.add_argument("--resolution", type=int, default=resolution, help=f"samples along the longest axis (default: {resolution})")
     arguments = parser.parse_args(list(argv))
     if arguments.verb == "list":
-        _list(arguments.statistics, arguments.seed, arguments.resolution)
+        _list(arguments.families, arguments.statistics, arguments.seed, arguments.resolution)
     elif arguments.verb == "make":
         _make(arguments)
     else:
@@ -55,24 +60,27 @@ def main(argv: Sequence[str], prog: str) -> int:
     return 0
 
 
-def _list(statistics: int, seed: int, resolution: int) -> None:
-    for name, family in FAMILIES.items():
+def _list(names: Sequence[str], statistics: int, seed: int, resolution: int) -> None:
+    for name in names or FAMILIES:
+        family = find_family(name)
         print(f"{name}: {family.summary}{' (validation only)' if name in HELD_OUT else ''}")
         about = meanings(family.parameters)
         for parameter, domain in family.ranges.items():
             print(f"    {parameter:<13} {about[parameter]}: {domain}")
         if statistics > 0:
-            clouds = [make_cloud(name, seed + k, resolution) for k in range(statistics)]
-            mean = [weighted_mean(cloud.density) for cloud in clouds]
-            filled = [np.count_nonzero(cloud.density) / cloud.density.size for cloud in clouds]
-            print(
-                f"    measured on {statistics} clouds at {resolution}: extinction-weighted mean over maximum {_spread(mean)}; "
-                f"share of the box that is not empty {_spread(filled)}"
-            )
+            measured = [measure(make_cloud(name, seed + k, resolution)) for k in range(statistics)]
+            print(f"    measured on {statistics} clouds at {resolution}: median (10th to 90th percentile)")
+            for quantity in dataclasses.fields(CloudStatistics):
+                print(f"        {quantity.name:<12} {_spread([getattr(m, quantity.name) for m in measured])}")
 
 
 def _spread(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
+    finite = [v for v in values if np.isfinite(v)]
+    if not finite:
+        return "none"
+    low, middle, high = np.quantile(finite, (0.1, 0.5, 0.9))
+    few = f", {len(finite)} clouds" if len(finite) < len(values) else ""
+    return f"{middle:.2f} ({low:.2f} to {high:.2f}{few})"
 
 
 def _make(arguments: argparse.Namespace) -> None:
@@ -105,28 +113,44 @@ def _make(arguments: argparse.Namespace) -> None:
 
 
 def _preview(arguments: argparse.Namespace) -> None:
+    from deepclouds_training.clouds._preview import Row
+
+    sheets = arguments.output.suffix.lower() != ".png"
+    if sheets and arguments.output.suffix:
+        raise InputError(f"{arguments.output}: previews are written as .png, or into a folder")
+    for name, value in (("count", arguments.count), ("size", arguments.size)):
+        if value < 1:
+            raise InputError(f"--{name} {value} shows nothing; it takes 1 or more")
+    names = arguments.families or list(FAMILIES)
+    families = [find_family(name) for name in names]
+    rows: list[Row] = []
+    for family in families:
+        # A family with kinds shows them one after the other rather than by chance.
+        kinds = [(key, d.options) for key, d in family.ranges.items() if isinstance(d, Choice)]
+        row = []
+        for k in range(arguments.count):
+            fixed = {key: options[k % len(options)] for key, options in kinds}
+            label = ", ".join([str(arguments.seed + k), *fixed.values()])
+            row.append((label, make_cloud(family.name, arguments.seed + k, arguments.resolution, **fixed)))
+        side = Row(f"{family.name}: {family.summary}", row, family.optical_depth)
+        if sheets:
+            above = Row("from above", row, family.optical_depth, "top")
+            _write_sheet(arguments.output / f"clouds_{family.name}.png", [side, above], arguments.size)
+        else:
+            rows.append(side)
+    if rows:
+        _write_sheet(arguments.output, rows, arguments.size)
+    print(f"{arguments.output}: {arguments.count} clouds of each of {', '.join(names)}")
+
+
+def _write_sheet(path: Path, rows: Sequence[Row], size: int) -> None:
     from PIL import Image
 
     from deepclouds.replacing import replacing
     from deepclouds_training.clouds._preview import contact_sheet
 
-    if arguments.output.suffix.lower() != ".png":
-        raise InputError(f"{arguments.output}: previews are written as .png")
-    for name, value in (("count", arguments.count), ("size", arguments.size)):
-        if value < 1:
-            raise InputError(f"--{name} {value} shows nothing; it takes 1 or more")
-    names = arguments.families or list(FAMILIES)
-    rows = []
-    for name in names:
-        # A family with kinds shows them one after the other rather than by chance.
-        kinds = [(key, d.options) for key, d in find_family(name).ranges.items() if isinstance(d, Choice)]
-        row = []
-        for k in range(arguments.count):
-            fixed = {key: options[k % len(options)] for key, options in kinds}
-            label = ", ".join([str(arguments.seed + k), *fixed.values()])
-            row.append((label, make_cloud(name, arguments.seed + k, arguments.resolution, **fixed)))
-        rows.append((f"{name}: {FAMILIES[name].summary}", row))
-    picture = Image.fromarray(contact_sheet(rows, arguments.size))
-    with replacing(arguments.output) as temporary:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # 128 colours show these pictures as well and take a third of the space.
+    picture = Image.fromarray(contact_sheet(rows, size)).quantize(128, dither=Image.Dither.NONE)
+    with replacing(path) as temporary:
         picture.save(temporary, format="PNG", optimize=True)
-    print(f"{arguments.output}: {arguments.count} clouds of each of {', '.join(names)}")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from deepclouds_training.clouds._heap import HeapParameters, heap
+from deepclouds_training.clouds._noise import Array
 from deepclouds_training.clouds._parameters import Streams, number
-from deepclouds_training.clouds._raster import Field
+from deepclouds_training.clouds._raster import Field, Grid
 from deepclouds_training.clouds._turrets import Balls, bud
 
 
@@ -20,6 +21,7 @@ class CumulusParameters(HeapParameters):
     width: float = number(1.0, 2.4, "width of the base over the height of the cloud")
     depth: float = number(0.5, 1.0, "depth of the base over its width")
     shear: float = number(0.0, 0.5, "how far the top leans over the base, over the height")
+    flatness: float = number(1.0, 3.0, "how far fair weather presses the heap flat: 1 is mediocris, 3 humilis", usual=1.0, usual_share=0.5)
 
 
 def towers(rng: np.random.Generator, count: int, width: float, depth: float, shear: float, height: float = 1.0) -> Balls:
@@ -42,8 +44,14 @@ def towers(rng: np.random.Generator, count: int, width: float, depth: float, she
 
 
 def build(parameters: CumulusParameters, streams: Streams) -> Field:
-    """Density of a cumulus over space; the base lies at y = 0, the top near 1."""
+    """Density of a cumulus over space; the base lies at y = 0, the top near 1 over the flatness."""
     rng = streams("towers")
     trunk = towers(rng, parameters.turrets, parameters.width, parameters.depth, parameters.shear)
     balls = bud(rng, trunk, 2, 7, 0.46, upward=0.35, floor=0.0)
-    return heap(balls, parameters, streams, turret=0.3, base=0.0)
+    body = heap(balls, parameters, streams, turret=0.3)
+    flat = np.array([1.0, parameters.flatness, 1.0])
+
+    def evaluate(grid: Grid) -> Array:
+        return body.evaluate(Grid(grid.x, grid.y * np.float32(parameters.flatness), grid.z, grid.spacing * flat))
+
+    return replace(body, lower=tuple(np.array(body.lower) / flat), upper=tuple(np.array(body.upper) / flat), evaluate=evaluate)

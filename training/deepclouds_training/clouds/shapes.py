@@ -21,6 +21,8 @@ SHAPES = (
     "torus",
     "two",
     "bright_voxel",
+    "sheet",
+    "voxel",
 )
 
 
@@ -29,11 +31,14 @@ class ShapesParameters(CloudParameters):
     """Parameters of a simple shape."""
 
     shape: str = choice(SHAPES, "which one")
-    height: float = number(0.2, 1.0, "second side over the longest one (ellipsoid, boxes, cylinder, ring of the torus)")
-    depth: float = number(0.2, 1.0, "third side over the longest one (ellipsoid, boxes)")
+    height: float = number(0.03, 1.0, "second side over the longest one (ellipsoid, boxes, cylinder, ring of the torus)", log=True)
+    depth: float = number(0.03, 1.0, "third side over the longest one (ellipsoid, boxes)", log=True)
     softness: float = number(0.0, 0.8, "width of the soft edge over half of the thinnest side", usual=0.0, usual_share=0.5)
     tilt: float = number(0.0, 90.0, "degrees of rotation about a random axis (not of boxes that fill the grid)", usual=0.0, usual_share=0.4)
     haze: float = number(0.01, 0.3, "density of the haze, or of the thin end of the gradient", log=True)
+    voxels: int = number(1, 4, "thickness of the sheet in voxels, and how many single voxels there are", integer=True)
+    curve: float = number(0.0, 1.0, "how far the sheet bends over its width", usual=0.0, usual_share=0.5)
+    gap: float = number(0.5, 6.0, "distance between the middles of two bodies over the sum of their radii", log=True)
 
 
 def _rotation(axis: Array, degrees: float) -> Array:
@@ -124,14 +129,27 @@ def build(parameters: ShapesParameters, streams: Streams) -> Field:
             return values
 
         return Field((-1, -height, -depth), (1, height, depth), speck, cut=fills)
+    if parameters.shape == "voxel":
+        places = rng.random((parameters.voxels, 3))
+
+        def lonely(grid: Grid) -> Array:
+            values = np.zeros(grid.shape, np.float32)
+            nz, ny, nx = grid.shape
+            for px, py, pz in places:
+                values[int(pz * nz), int(py * ny), int(px * nx)] = 1
+            return values
+
+        return Field((-1, -height, -depth), (1, height, depth), lonely, cut=fills, fewest=1)
 
     axis = rng.standard_normal(3)
     turn = _rotation(axis / np.linalg.norm(axis), parameters.tilt)
+    if parameters.shape == "sheet":
+        return _sheet(parameters, turn)
     if parameters.shape == "two":
         kinds = [("sphere", "ellipsoid", "box", "cylinder", "torus")[i] for i in rng.integers(5, size=2)]
         sizes = np.array([1.0, rng.uniform(0.3, 1.0)])
         away = rng.standard_normal(3)
-        away *= rng.uniform(0.9, 1.8) * sizes.sum() / 2 / np.linalg.norm(away)
+        away *= parameters.gap * sizes.sum() / np.linalg.norm(away)
         levels = np.array([1.0, rng.uniform(0.2, 1.0)])
         centres = np.array([-away / 2, away / 2])
     else:
@@ -155,3 +173,24 @@ def build(parameters: ShapesParameters, streams: Streams) -> Field:
     lower = np.min([c - r for c, r in zip(centres, reaches, strict=True)], axis=0)
     upper = np.max([c + r for c, r in zip(centres, reaches, strict=True)], axis=0)
     return Field(tuple(lower - 0.02), tuple(upper + 0.02), solids)
+
+
+def _sheet(parameters: ShapesParameters, turn: Array) -> Field:
+    """A square sheet, a few voxels thick whatever the resolution: flat or bent like a piece of pipe, upright or turned."""
+    bend = np.float32(parameters.curve)
+
+    def thin(grid: Grid) -> Array:
+        x, y, z = grid.open()
+        # The middle of an upright sheet falls on samples (or between them, for an even number), so that it is exactly that thick.
+        k = len(grid.y) // 2
+        centre = np.float32(grid.y[k]) if parameters.voxels % 2 else np.float32(0.5) * (grid.y[k - 1] + grid.y[k])
+        px, py, pz = (turn[i, 0] * x + turn[i, 1] * (y - centre) + turn[i, 2] * z for i in range(3))
+        off = np.abs(py - bend * (px**2 - np.float32(0.5))) / np.sqrt(1 + (2 * bend * px) ** 2)
+        # The spacing across the sheet is that along its normal.
+        across = np.float32(np.linalg.norm(grid.spacing * turn[1]))
+        body = np.clip(np.float32(0.5 * parameters.voxels + 0.5) - off / across, 0, 1)
+        return np.asarray(body * ((np.abs(px) <= 1) & (np.abs(pz) <= 1)), np.float32)
+
+    half = np.array([1.0, max(0.5 * parameters.curve, 0.0) + 0.15, 1.0])
+    reach = np.abs(turn.T) @ half
+    return Field(tuple(-reach), tuple(reach), thin, averaged=False)
