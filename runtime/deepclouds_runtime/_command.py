@@ -141,8 +141,16 @@ def run(argv: Sequence[str], prog: str) -> int:
     with _progress(arguments.quiet) as progress:
         result = renderer.render(arguments.spp, arguments.seed, progress)
     sensor = renderer.scene.sensor
-    camera = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
-    fov = np.ravel(np.array(mitsuba().traverse(sensor)["x_fov"]))
+    parameters = mitsuba().traverse(sensor)
+    camera: dict[str, Any] = {
+        "type": sensor.class_name(),
+        "to_world": np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4).tolist(),
+        "film": [int(v) for v in sensor.film().size()],
+        "crop_offset": [int(v) for v in sensor.film().crop_offset()],
+    }
+    for name in ("x_fov", "aperture_radius", "focus_distance"):
+        if name in parameters:
+            camera[name] = [float(v) for v in np.ravel(np.array(parameters[name]))]
     settings = {
         "command": shlex.join([*prog.split(), *argv]),
         "version": version("deepclouds"),
@@ -155,7 +163,7 @@ def run(argv: Sequence[str], prog: str) -> int:
         **how,
         "environment_directions": renderer.environment_directions,
         "size": renderer.scene.size,
-        "camera": {"to_world": camera.tolist(), "fov": [float(v) for v in fov]},
+        "camera": camera,
         "suns": [asdict(sun) for sun in renderer.scene.suns],
         "hide_emitters": renderer.scene.hide_emitters,
         "extinction": renderer.scene.scale,

@@ -104,6 +104,6 @@ def _develop(mi: Any, film: Any, result: Any, develop: bool) -> Any:
     planes = [result.rgb, np.ones_like(result.alpha)[..., None]]
     if channels == 5:
         planes.insert(1, result.alpha[..., None])
-    block = mi.ImageBlock(mi.TensorXf(np.ascontiguousarray(np.concatenate(planes, axis=-1))))
+    block = mi.ImageBlock(mi.TensorXf(np.ascontiguousarray(np.concatenate(planes, axis=-1))), film.crop_offset())
     film.put_block(block)
     return film.develop() if develop else mi.TensorXf()

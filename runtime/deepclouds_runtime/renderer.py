@@ -15,6 +15,7 @@ from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
+from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.lights import Shade, environment, mitsuba_radiance
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, WalkScattering
 from deepclouds_runtime.scene import CloudScene
@@ -151,7 +152,7 @@ class Renderer:
         if scene.max_depth != 2:
             scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering), self._lights()
-        work = _Work(scene, cloud, lights, lights, types, samples, seed, self._interreflection)
+        work = _Work(scene, Camera(types, scene.sensor), cloud, lights, lights, types, samples, seed, self._interreflection)
         work.spent("lights", started)
         if self._interreflection:
             clock = time.perf_counter()
@@ -184,6 +185,7 @@ class _Work:
     """The passes of one render and what they gathered."""
 
     scene: CloudScene
+    camera: Camera
     cloud: Cloud
     on_surfaces: Lights
     on_cloud: Lights
@@ -205,7 +207,7 @@ class _Work:
         local = index // count
         pixel = local + dr.opaque(types.UInt32, first)
         numbers = Stratified(types, pixel, index - local * count, count, dr.opaque(types.UInt32, self.seed & 0xFFFFFFFF))
-        origin, direction, end, camera = self._rays(pixel, numbers)
+        origin, direction, end = self.camera.rays(pixel, numbers)
         interaction: Any = None
         shown: Any = None
         if scene.surfaces is not None:
@@ -219,7 +221,7 @@ class _Work:
         self._collect("volume_direct", light.direct)
         self._collect("volume_indirect", light.indirect)
         self._collect("volume_opacity", [light.opacity])
-        depth = dr.norm(dr.fma(direction, light.distance, origin) - camera)
+        depth = self.camera.distance(dr.fma(direction, light.distance, origin))
         self._collect("volume_Z", [depth * light.opacity])
         through = light.transmittance
         behind = through
@@ -239,19 +241,6 @@ class _Work:
             alpha = alpha + behind
         self._collect("A", [alpha])
         self.spent("surfaces and background", clock)
-
-    def _rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any, Any]:
-        """Camera rays of the lanes: origin, direction, end, and the camera's place."""
-        mi, types, sensor = mitsuba(), self.types, self.scene.sensor
-        width, height = (dr.opaque(types.UInt32, v) for v in self.scene.size)
-        row = pixel // width
-        x = types.Float(pixel - row * width) + numbers.number(stratified.PIXEL_X)
-        y = types.Float(row) + numbers.number(stratified.PIXEL_Y)
-        place = mi.Point2f(x / types.Float(width), y / types.Float(height))
-        ray, _ = sensor.sample_ray(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
-        place_of_camera = np.array(sensor.world_transform().matrix, np.float32).reshape(4, 4)[:3, 3]
-        camera = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in place_of_camera))
-        return plain(types, ray.o), plain(types, ray.d), plain(types, ray.maxt), camera
 
     def _surfaces(self, origin: Any, direction: Any, end: Any) -> tuple[Any, Any, Any]:
         """What the rays hit, where they end, and whether they hit anything."""

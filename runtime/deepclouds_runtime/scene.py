@@ -19,6 +19,7 @@ from deepclouds_runtime.placement import box_transform, cube_transform, locate
 _LOG = logging.getLogger(__name__)
 _LOBES = ("HGPhaseFunction", "IsotropicPhaseFunction")
 _PHASE_NAMES = "`hg`, `isotropic` and a `blendphase` of two of them"
+_CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 _UNLIMITED = 0xFFFFFFFF
 # A homogeneous ball becomes a grid of this many voxels a side, each filled by the share of it that lies inside.
@@ -81,8 +82,8 @@ class CloudScene:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the image in pixels."""
-        width, height = self.sensor.film().size()
+        """Width and height of the image in pixels: those of the film's crop window."""
+        width, height = self.sensor.film().crop_size()
         return int(width), int(height)
 
 
@@ -103,8 +104,8 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     InputError
         for everything outside of what we render: more or less than one cloud, chromatic extinction, varying albedo, phase functions other
         than `hg`, `isotropic` and a `blendphase` of two of them, emitters other than `directional`, `constant` and `envmap`, cameras
-        other than `perspective`, crop windows, path lengths other than -1 and 2, surfaces that let light through, media outside of the
-        cloud, images without pixels.
+        other than `perspective`, `thinlens` and `orthographic`, path lengths other than -1 and 2, surfaces that let light through, media
+        outside of the cloud, images without pixels.
     """
     notes: list[str] = []
     camera = _camera(scene, sensor, notes)
@@ -167,14 +168,10 @@ def _camera(scene: Any, sensor: Any, notes: list[str]) -> Any:
         if not 0 <= sensor < len(sensors):
             raise InputError(f"sensor {sensor}: the scene has {len(sensors)} sensors, counted from 0")
         sensor = sensors[sensor]
-    if sensor.class_name() != "PerspectiveCamera":
-        raise InputError(f"sensor {sensor.class_name()}: deepclouds renders the `perspective` sensor only")
+    if sensor.class_name() not in _CAMERAS:
+        raise InputError(f"sensor {sensor.class_name()}: deepclouds renders the sensors `perspective`, `thinlens` and `orthographic`")
     film = sensor.film()
-    check_size(*(int(n) for n in film.size()))
-    if tuple(film.crop_size()) != tuple(film.size()):
-        raise InputError(
-            f"film: a crop window of {tuple(film.crop_size())} in {tuple(film.size())}: render the whole image and crop it afterwards"
-        )
+    check_size(*(int(n) for n in film.crop_size()))
     if film.class_name() != "HDRFilm":
         raise InputError(f"film {film.class_name()}: deepclouds renders into `hdrfilm` only")
     if film.rfilter().class_name() != "BoxFilter":

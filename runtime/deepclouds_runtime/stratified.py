@@ -10,9 +10,12 @@ import numpy as np
 # Fractional parts of the square roots of primes (Richtmyer 1951), as 32-bit fixed-point steps, so that long sequences keep their digits;
 # the first two are the powers of the plastic number instead, the best spread for pairs.
 _STEPS = tuple(
-    round(float(value % 1.0) * 2**32) for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29]))
+    round(float(value % 1.0) * 2**32)
+    for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37]))
 )
-PIXEL_X, PIXEL_Y, MARCH, LIGHT_U, LIGHT_V, PHASE_U, PHASE_V, SURFACE_U, SURFACE_V, SURFACE_W, SHADOW, ROULETTE = range(len(_STEPS))
+PIXEL_X, PIXEL_Y, MARCH, LIGHT_U, LIGHT_V, PHASE_U, PHASE_V, SURFACE_U, SURFACE_V, SURFACE_W, SHADOW, ROULETTE, LENS_U, LENS_V = range(
+    len(_STEPS)
+)
 DEPTH = len(_STEPS)
 _DIMENSIONS = DEPTH + 1
 

@@ -224,13 +224,24 @@ def test_refusals_name_what_they_refuse(mi: Any, folder: Path, name: str) -> Non
     assert said in str(caught.value)
 
 
+@pytest.mark.parametrize("kind", ["perspective", "orthographic", "thinlens"])
+def test_cameras_and_crop_windows(mi: Any, folder: Path, kind: str) -> None:
+    crop = '<integer name="crop_width" value="2"/><integer name="crop_height" value="3"/><integer name="crop_offset_x" value="1"/>'
+    camera = CAMERA.format(film=BOX + crop).replace('"perspective">', f'"{kind}">')
+    if kind == "thinlens":
+        camera = camera.replace('"thinlens">', '"thinlens"><float name="aperture_radius" value="0.1"/>')
+    assert read_scene(load(mi, folder, cloud(), camera)).size == (2, 3)
+
+
+ONE_PIXEL = '<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/></film>'
+
+
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
-        (CAMERA.format(film=BOX).replace("perspective", "orthographic"), "Orthographic"),
+        (f'<sensor type="radiancemeter">{ONE_PIXEL}</sensor>', "RadianceMeter"),
+        (f'<sensor type="distant">{ONE_PIXEL}</sensor>', "Distant"),
         (CAMERA.format(film=BOX).replace('"perspective">', '"perspective"><medium type="homogeneous"/>'), "stands in a medium"),
-        (CAMERA.format(film=BOX).replace('"perspective">', '"thinlens"><float name="aperture_radius" value="0.1"/>'), "ThinLens"),
-        (CAMERA.format(film=BOX + '<integer name="crop_width" value="2"/><integer name="crop_height" value="2"/>'), "crop"),
     ],
 )
 def test_cameras_that_are_refused(mi: Any, folder: Path, camera: str, said: str) -> None:
