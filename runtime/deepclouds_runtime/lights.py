@@ -16,6 +16,8 @@ from deepclouds_runtime.stratified import Stratified
 # Cells of the table never drawn would bias the image where the table misses a light between its samples.
 _UNIFORM_SHARE = 0.02
 _MAX_WIDTH = 2048
+# Rows and columns for a sky that is a formula: it is smooth.
+_SKY = (64, 128)
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -190,15 +192,15 @@ def mitsuba_radiance(types: ModuleType, emitter: Any) -> Callable[[Any], list[An
 
 
 def environment(types: ModuleType, emitter: Any, shade: Shade) -> Environment:
-    """The `envmap` or `constant` emitter of a Mitsuba scene as a light source."""
+    """The `envmap`, `constant` or (sunless) `sunsky` emitter of a Mitsuba scene as a light source."""
     mi = mitsuba()
     radiance = mitsuba_radiance(types, emitter)
     frame = np.array(emitter.world_transform().matrix, np.float64).reshape(4, 4)[:3, :3]
     frame = frame / np.linalg.norm(frame, axis=0)
     parameters = mi.traverse(emitter)
-    if "data" not in parameters:
+    if "data" not in parameters and "turbidity" not in parameters:
         return Environment(types, radiance, np.ones((1, 1)), frame, shade)
-    map_rows, map_columns = np.array(parameters["data"]).shape[:2]
+    map_rows, map_columns = np.array(parameters["data"]).shape[:2] if "data" in parameters else _SKY
     columns = int(min(_MAX_WIDTH, max(64, map_columns)))
     rows = max(columns // 2, 32)
     power = _table(types, radiance, frame, rows, columns, max(2, -(-2 * map_rows // rows)))

@@ -235,8 +235,8 @@ class _Work:
             self._collect("surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)
             alpha = alpha + dr.select(shown, through, 0)
-        if scene.environment is not None and not scene.hide_emitters:
-            sky = mitsuba_radiance(types, scene.environment)(direction)
+        if scene.backdrop is not None and not scene.hide_emitters:
+            sky = mitsuba_radiance(types, scene.backdrop)(direction)
             self._collect("background", [value * behind for value in sky])
             alpha = alpha + behind
         self._collect("A", [alpha])

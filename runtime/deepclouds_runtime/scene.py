@@ -15,11 +15,13 @@ from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.placement import box_transform, cube_transform, locate
+from deepclouds_runtime.sunsky import split
 
 _LOG = logging.getLogger(__name__)
 _LOBES = ("HGPhaseFunction", "IsotropicPhaseFunction")
 _PHASE_NAMES = "`hg`, `isotropic` and a `blendphase` of two of them"
 _CAMERAS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
+_LIGHT_NAMES = "`directional`, `constant`, `envmap` and `sunsky`"
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 _UNLIMITED = 0xFFFFFFFF
 # A homogeneous ball becomes a grid of this many voxels a side, each filled by the share of it that lies inside.
@@ -55,7 +57,7 @@ class CloudScene:
     suns
         directional lights.
     environment
-        Mitsuba's `envmap` or `constant` emitter, or None.
+        Mitsuba's `envmap`, `constant` or (without its sun) `sunsky` emitter that lights the scene, or None.
     surfaces
         Mitsuba scene of the real surfaces alone, without the containers of the medium; None when there are none.
     sensor
@@ -66,6 +68,8 @@ class CloudScene:
         -1 for all orders of scattering, 2 for single scattering alone.
     notes
         what was approximated in reading, in sentences.
+    backdrop
+        the environment emitter that the camera sees, or None.
     """
 
     volume: Volume
@@ -79,6 +83,7 @@ class CloudScene:
     hide_emitters: bool = False
     max_depth: int = -1
     notes: tuple[str, ...] = field(default=())
+    backdrop: Any = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -103,9 +108,9 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     ------
     InputError
         for everything outside of what we render: more or less than one cloud, chromatic extinction, varying albedo, phase functions other
-        than `hg`, `isotropic` and a `blendphase` of two of them, emitters other than `directional`, `constant` and `envmap`, cameras
-        other than `perspective`, `thinlens` and `orthographic`, path lengths other than -1 and 2, surfaces that let light through, media
-        outside of the cloud, images without pixels.
+        than `hg`, `isotropic` and a `blendphase` of two of them, emitters other than `directional`, `constant`, `envmap` and `sunsky`,
+        cameras other than `perspective`, `thinlens` and `orthographic`, path lengths other than -1 and 2, surfaces that let light through,
+        media outside of the cloud, images without pixels.
     """
     notes: list[str] = []
     camera = _camera(scene, sensor, notes)
@@ -115,7 +120,8 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
         raise InputError(f"{found}; deepclouds renders scenes with exactly one cloud: a shape with a null BSDF and a medium inside")
     _check_camera_medium(camera, containers[0])
     volume, scale, albedo, phase = _read_medium(containers[0])
-    suns, environment = read_lights(scene)
+    lights = read_lights(scene)
+    notes.extend(lights.notes)
     integrator = scene.integrator()
     if max_depth is None:
         max_depth = _integrator_depth(integrator)
@@ -126,13 +132,14 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
         scale,
         albedo,
         phase,
-        suns,
-        environment,
+        lights.suns,
+        lights.environment,
         surfaces_alone(surfaces),
         camera,
         hide_emitters,
         check_depth(max_depth),
         tuple(notes),
+        lights.backdrop,
     )
 
 
@@ -194,7 +201,7 @@ def _split_shapes(scene: Any) -> tuple[list[Any], list[Any]]:
         name = f"shape '{shape.id()}' ({shape.class_name()})"
         bsdf = shape.bsdf()
         if shape.is_emitter():
-            raise InputError(f"{name} is an area light; the lights we know are `directional`, `constant` and `envmap`")
+            raise InputError(f"{name} is an area light; the lights we know are {_LIGHT_NAMES}")
         if shape.exterior_medium() is not None:
             raise InputError(f"{name} has a medium outside; deepclouds renders one cloud in empty space: leave out its `exterior`")
         null = bsdf is None or bsdf.class_name() == "Null"
@@ -223,22 +230,39 @@ def surfaces_alone(surfaces: list[Any]) -> Any:
     return mitsuba().load_dict({"type": "scene", **{f"surface{i}": shape for i, shape in enumerate(surfaces)}})
 
 
-def read_lights(scene: Any) -> tuple[tuple[Sun, ...], Any]:
-    """Suns and the environment emitter (or None) of a Mitsuba scene; raises InputError for lights of other kinds."""
+@dataclass(frozen=True)
+class SceneLights:
+    """The lights of a scene: suns, the environment without them, the emitter that the camera sees, and what was approximated."""
+
+    suns: tuple[Sun, ...]
+    environment: Any
+    backdrop: Any
+    notes: tuple[str, ...]
+
+
+def read_lights(scene: Any) -> SceneLights:
+    """All lights of a Mitsuba scene; raises InputError for lights of other kinds."""
     mi = mitsuba()
     suns: list[Sun] = []
-    environment = None
+    notes: list[str] = []
+    environment = backdrop = None
     for emitter in scene.emitters():
         kind = emitter.class_name()
         if kind == "DirectionalEmitter":
             sample, irradiance = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
             x, y, z = (float(sample.d[c][0]) for c in range(3))
             suns.append(Sun((x, y, z), tuple(float(irradiance[c][0]) for c in range(len(irradiance)))))
+        elif kind == "SunskyEmitter":
+            parts = split(emitter)
+            environment, backdrop = parts.sky, emitter
+            if max(parts.irradiance) > 0:
+                suns.append(Sun(parts.omega_sun, parts.irradiance))
+                notes.append(f"the sunsky's disc of {parts.aperture:.3g} degrees lights from its middle: shadows have no penumbra")
         elif kind in _ENVIRONMENTS:
-            environment = emitter
+            environment = backdrop = emitter
         else:
-            raise InputError(f"emitter '{emitter.id()}' ({kind}): the lights we know are `directional`, `constant` and `envmap`")
-    return tuple(suns), environment
+            raise InputError(f"emitter '{emitter.id()}' ({kind}): the lights we know are {_LIGHT_NAMES}")
+    return SceneLights(tuple(suns), environment, backdrop, tuple(notes))
 
 
 def _read_medium(container: Any) -> tuple[Volume, float, tuple[float, ...], tuple[float, float, float]]:

@@ -111,7 +111,7 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
         if "envmap" in str(error):
             raise InputError(f"{options.env}: not an environment map that Mitsuba reads; give a latitude-longitude .exr or .hdr") from error
         raise InputError(f"{source}: Mitsuba cannot build the scene around it ({error})") from error
-    suns, environment = read_lights(scene)
+    lights = read_lights(scene)
     channels = len(mi.Spectrum())
     albedo = _three(options.albedo) if channels == 3 else (float(np.dot(_three(options.albedo), (0.2126, 0.7152, 0.0722))),)
     return CloudScene(
@@ -119,12 +119,13 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
         scale,
         albedo,
         lobes(options),
-        suns,
-        environment,
+        lights.suns,
+        lights.environment,
         None,
         scene.sensors()[0],
         options.hide_emitters,
         check_depth(options.max_depth),
+        backdrop=lights.backdrop,
     )
 
 

@@ -126,17 +126,18 @@ def _render(mi: Any, case: Case) -> RenderResult:
         shape.setdefault("bsdf", {"type": "twosided", "inner": {"type": "diffuse"}})
         description["surface"] = shape
     scene = mi.load_dict(description)
-    suns, environment = read_lights(scene)
+    lights = read_lights(scene)
     read = CloudScene(
         volume,
         case.optical_depth / line if line > 0 else 1.0,
         case.albedo,
         (case.g, 0.0, 1.0),
-        suns,
-        environment,
+        lights.suns,
+        lights.environment,
         surfaces_alone(list(scene.shapes())),
         scene.sensors()[0],
         max_depth=case.max_depth,
+        backdrop=lights.backdrop,
     )
     return Renderer(read, Formula()).render(case.spp, seed=3)
 

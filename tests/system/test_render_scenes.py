@@ -41,6 +41,11 @@ CROP = (
     '<integer name="crop_width" value="12"/><integer name="crop_height" value="8"/>'
     '<integer name="crop_offset_x" value="9"/><integer name="crop_offset_y" value="5"/>'
 )
+SUNSKY = (
+    '<emitter type="sunsky"><vector name="sun_direction" value="0.5, 1, 0.8"/><float name="turbidity" value="4"/>'
+    '<rgb name="albedo" value="0.2 0.3 0.1"/><float name="sun_scale" value="{0}"/><float name="sky_scale" value="2"/>'
+    '<transform name="to_world"><rotate x="1" angle="-90"/></transform></emitter>'
+)
 HG = '<phase type="hg"><float name="g" value="0.4"/></phase>'
 BLEND = '<phase type="blendphase"><float name="weight" value="0.35"/>{0}{1}</phase>'
 TWO_LOBES = BLEND.format(
@@ -77,6 +82,9 @@ SCENES = {
     "crop": replace(BASE, film=FILM.format(24, 16, CROP)),
     "orthographic, crop, portrait": replace(BASE, camera=ORTHOGRAPHIC, film=FILM.format(22, 30, CROP)),
     "three suns and a sky": replace(BASE, light=SUN + OTHER + OTHER.replace("0.9, 0.2", "0.1, 2") + CONSTANT),
+    "sun and sky": replace(BASE, light=SUNSKY.format(1)),
+    "sun and sky, floor": replace(BASE, light=SUNSKY.format(0.2), surfaces=FLOOR),
+    "sky without its sun": replace(BASE, light=SUNSKY.format(0)),
     "two lobes, sun": replace(BASE, phase=TWO_LOBES),
     "two lobes, sky": replace(BASE, phase=TWO_LOBES, light=CONSTANT),
     "two lobes, all orders": replace(BASE, phase=TWO_LOBES, light=SUN, max_depth=-1, spp=256, noise=0.01, scale=3.0),

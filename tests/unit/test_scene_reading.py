@@ -6,10 +6,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from deepclouds_runtime.placement import box_transform, cube_transform, locate, orientations
 from deepclouds_runtime.scene import check_depth, read_scene
+from deepclouds_runtime.sunsky import split
 
 from deepclouds.errors import InputError
 from deepclouds.medium.phase import two_lobe_numpy
@@ -106,10 +108,59 @@ def test_lights_camera_and_integrator(mi: Any, folder: Path) -> None:
     np.testing.assert_allclose(read.suns[0].omega_sun, (0, 1, 0), atol=1e-6)
     np.testing.assert_allclose(read.suns[0].irradiance, (3, 2, 1))
     assert read.environment is not None
+    assert read.backdrop is read.environment
     assert len(read.surfaces.shapes()) == 1
     assert read.size == (6, 4)
     assert read_scene(load(mi, folder, cloud())).surfaces is None
     assert not read_scene(load(mi, folder, integrator + cloud()), hide_emitters=False).hide_emitters
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"sun_direction": [0.3, 0.2, 0.9], "turbidity": 3.0},
+        {"sun_direction": [0.3, 0.2, 0.9], "sun_aperture": 4.0, "complex_sun": True, "sun_scale": 20.0},
+        {"hour": 9.0, "latitude": 47.0, "month": 5, "upright": True, "sky_scale": 0.5},
+    ],
+)
+def test_a_sunsky_becomes_a_sky_and_a_sun(mi: Any, options: dict[str, Any]) -> None:
+    """The sun's irradiance is that of the emitter's own samples of the disc; beside the disc the sky is the emitter's own."""
+    options = dict(options)
+    if options.pop("upright", False):
+        options["to_world"] = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    emitter = mi.load_dict({"type": "sunsky", "albedo": {"type": "rgb", "value": [0.2, 0.4, 0.1]}, **options})
+    parts = split(emitter)
+    assert parts.aperture == pytest.approx(options.get("sun_aperture", 0.5358))
+    random = np.random.default_rng(5)
+    sample, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 100_000), mi.Point2f(random.random((2, 100_000))))
+    directions, weights = np.array(sample.d).T, np.array(weight).T
+    cosine = directions @ parts.omega_sun
+    disc = cosine > np.cos(np.deg2rad(parts.aperture / 2))
+    sky = np.array(_eval(mi, parts.sky, directions))
+    share = (weights - sky / np.array(sample.pdf)[:, None]) * (cosine * disc)[:, None]
+    np.testing.assert_allclose(parts.irradiance, share.mean(axis=0), rtol=0.02)
+    assert disc.mean() > 0.1
+    away = cosine < np.cos(np.deg2rad(parts.aperture / 2 + 0.1))
+    np.testing.assert_allclose(sky[away], np.array(_eval(mi, emitter, directions))[away], rtol=1e-4, atol=1e-6)
+
+
+def _eval(mi: Any, emitter: Any, directions: Any) -> Any:
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    interaction.wi = mi.Vector3f(np.ascontiguousarray(-directions.T, np.float32))
+    return np.array(emitter.eval(interaction)).T
+
+
+def test_a_scene_under_a_sunsky(mi: Any, folder: Path) -> None:
+    light = '<emitter type="sunsky"><vector name="sun_direction" value="0.3, 0.2, 0.9"/><float name="sun_scale" value="{0}"/></emitter>'
+    scene = load(mi, folder, cloud() + light.format(1))
+    read = read_scene(scene)
+    assert len(read.suns) == 1
+    np.testing.assert_allclose(read.suns[0].omega_sun, np.array([0.3, 0.2, 0.9]) / np.linalg.norm([0.3, 0.2, 0.9]), atol=1e-6)
+    assert read.backdrop is not read.environment
+    assert "0.536 degrees" in read.notes[0]
+    without = read_scene(load(mi, folder, cloud() + light.format(0)))
+    assert not without.suns
+    assert not without.notes
 
 
 def test_homogeneous_media(mi: Any, folder: Path) -> None:
