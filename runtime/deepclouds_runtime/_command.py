@@ -48,8 +48,8 @@ def _positive(text: str) -> int:
 
 
 def _seed(text: str) -> int:
-    if not re.fullmatch(r"\d+", text):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
+    if not re.fullmatch(r"\d+", text) or int(text) > 0xFFFFFFFF:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number below {1 << 32}")
     return int(text)
 
 

@@ -336,6 +336,8 @@ def options_from(given: dict[str, Any]) -> VolumeOptions:
         for an unknown name, and for names that exclude each other.
     """
     unknown = sorted(set(given) - set(NAMES))
+    if unknown == ["sensor"]:
+        raise InputError("the option 'sensor' belongs to a scene; a volume has one camera, which `view` places")
     if unknown:
         raise InputError(f"unknown option '{unknown[0]}' for a volume; there are: {', '.join(NAMES)}")
     if "env" in given:

@@ -1,0 +1,155 @@
+"""Every flag of `deepclouds render CLOUD.vdb`: a good value shows in the image, a bad one ends in code 2 and says what to do.
+
+Rationale: a flag that is parsed and then forgotten is found by nobody who looks at one picture; a bad value that is clipped in silence
+is found too late. Expected behaviour: as said, for each flag that the parser knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+import deepclouds_runtime
+import numpy as np
+import pytest
+from deepclouds_runtime._command import _parser
+from numpy.typing import NDArray
+
+from deepclouds.cli import main
+from deepclouds.exr import read_exr, write_exr
+from deepclouds.volume import Volume, write_vol
+
+CLOUD = Path(deepclouds_runtime.__file__).parent / "data" / "demo.vdb"
+# Values that change the image.
+CHANGING = {
+    "--spp": ["3"],
+    "--seed": ["7"],
+    "--max-depth": ["2"],
+    "--hide-emitters": [],
+    "--env-directions": ["5"],
+    "--optical-depth": ["20"],
+    "--extinction": ["3"],
+    "--albedo": ["0.9,0.8,0.7"],
+    "--g": ["-0.3"],
+    "--phase": ["0.8,-0.2,0.7"],
+    "--sun": ["-40,20"],
+    "--irradiance": ["1,2,3"],
+    "--env": ["{folder}/sky.exr"],
+    "--sky": ["0.3,0.2,0.1"],
+    "--up": ["z"],
+    "--view": ["-30,-20"],
+    "--size": ["20x12"],
+}
+# Values that do not: they choose how, name what is chosen anyway, or concern surfaces and files that this cloud does not have.
+KEEPING = {
+    "--threads": ["2"],
+    "--quiet": [],
+    "--grid": ["density"],
+    "--clamp": [],
+    "--no-interreflection": [],
+    "--png": ["{folder}/other.png"],
+    "--exposure": ["1"],
+    "--multiple": ["walks"],
+}
+# Not for a volume, or a choice of the network, which has tests of its own.
+ELSEWHERE = {"--output", "--sensor", "--model", "--help", "-D", "--mode", "--error"}
+
+
+@pytest.fixture(autouse=True)
+def mi(llvm_mitsuba: ModuleType) -> ModuleType:
+    return llvm_mitsuba
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_exr(tmp_path / "sky.exr", {c: np.linspace(0, 1, 32, dtype=np.float32).reshape(4, 8) for c in "RGB"})
+    (tmp_path / "text.exr").write_text("no image")
+    write_vol(tmp_path / "empty.vol", Volume.from_box(np.zeros((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1)))
+    return tmp_path
+
+
+def _render(folder: Path, arguments: Sequence[str]) -> NDArray[np.float32]:
+    out = folder / "image.exr"
+    fixed = ["render", str(CLOUD), "-o", str(out), "--multiple", "walks", "--size", "16x12", "--spp", "1"]
+    assert main([*fixed, *(a.format(folder=folder) for a in arguments)]) == 0
+    channels = read_exr(out).channels
+    return np.stack([channels[c] for c in "RGBA"], axis=-1)
+
+
+def test_every_flag_is_tried() -> None:
+    flags = {option.option_strings[-1] for option in _parser("deepclouds render")._actions if option.option_strings}
+    assert flags <= set(CHANGING) | set(KEEPING) | ELSEWHERE
+    assert set(CHANGING) | set(KEEPING) <= flags
+
+
+def test_good_values_show(folder: Path) -> None:
+    plain = _render(folder, [])
+    assert np.array_equal(plain, _render(folder, []))
+    for flag, values in CHANGING.items():
+        image = _render(folder, [flag, *values])
+        assert image.shape != plain.shape or not np.allclose(image, plain, rtol=1e-4), flag
+    for flag, values in KEEPING.items():
+        np.testing.assert_allclose(_render(folder, [flag, *values]), plain, rtol=1e-5, err_msg=flag)
+    assert (folder / "other.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--spp", "0"], "--spp: '0' is not a whole number above 0"),
+        (["--spp", "1.5"], "--spp: '1.5' is not a whole number above 0"),
+        (["--seed", "-1"], "--seed: '-1' is not a whole number"),
+        (["--seed", "4294967296"], "--seed: '4294967296' is not a whole number below 4294967296"),
+        (["--max-depth", "3"], "max_depth = 3: deepclouds renders all orders of scattering (-1) or single scattering alone (2)"),
+        (["--max-depth", "deep"], "--max-depth: invalid int value: 'deep'"),
+        (["--env-directions", "0"], "--env-directions: '0' is not a whole number above 0"),
+        (["--optical-depth", "inf"], "optical_depth = inf: give a finite number"),
+        (["--optical-depth", "1e20"], "optical_depth = 1e+20: give at most"),
+        (["--extinction", "-1"], "extinction = -1.0: give a finite number that is not negative"),
+        (["--albedo", "white"], "--albedo: 'white' is not 1 or 3 numbers"),
+        (["--albedo", "nan"], "albedo = (nan,): give one or three finite numbers"),
+        (["--albedo", "1,1,2"], "albedo = (1.0, 1.0, 2.0): values lie in 0 to 1"),
+        (["--g", "-1"], "g = -1.0: give a value between -1 and 1"),
+        (["--g", "nan"], "g = nan: give a value between -1 and 1"),
+        (["--phase", "1,0,0.5"], "phase = (1.0, 0.0, 0.5): give g1 and g2 between -1 and 1"),
+        (["--phase", "0.5,0"], "--phase: '0.5,0' is not 3 numbers"),
+        (["--sun", "nan,0"], "sun = (nan, 0.0): give azimuth and elevation in degrees"),
+        (["--sun", "1,2,3"], "--sun: '1,2,3' is not 2 numbers"),
+        (["--irradiance", "inf"], "irradiance = (inf,): give one or three finite numbers"),
+        (["--sky", "-1"], "sky = (-1.0,): give one or three finite numbers that are not negative"),
+        (["--sky", "1e30"], "sky = (1e+30,): give values of at most 1e+15"),
+        (["--env", "{folder}"], "no such environment map"),
+        (["--env", "{folder}/text.exr"], "text.exr: not an environment map that Mitsuba reads; give a latitude-longitude .exr or .hdr"),
+        (["--up", "x"], "--up: invalid choice: 'x' (choose from"),
+        (["--view", "0,95"], "view = (0.0, 95.0): the elevation lies between -90 and 90 degrees"),
+        (["--size", "0x4"], "--size: '0x4' is not WIDTHxHEIGHT"),
+        (["--size", "-3x4"], "--size: '-3x4' is not WIDTHxHEIGHT"),
+        (["--grid", "flames"], "no grid called 'flames'. Grids: density"),
+        (["--sensor", "1"], "the option 'sensor' belongs to a scene"),
+        (["-Dx=1"], "-Dx has no meaning for a volume"),
+        (["--threads", "0"], "--threads: '0' is not a whole number above 0"),
+        (["--exposure", "inf", "--png"], "exposure = inf: give stops between"),
+        (["--png", "{folder}/x.jpg"], "x.jpg: the name must end in .png"),
+        (["--png", "{folder}/nowhere/x.png"], "the folder {folder}/nowhere does not exist; create it first"),
+        (["--output", "{folder}/x.png"], "x.png: the name must end in .exr"),
+        (["--model", "{folder}"], "no such model file"),
+        (["--multiple", "none"], "--multiple: invalid choice: 'none'"),
+    ],
+)
+def test_bad_values_end_in_code_2(folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
+    before = sorted(folder.iterdir())
+    try:
+        code: object = main(["render", str(CLOUD), "-o", str(folder / "image.exr"), *(a.format(folder=folder) for a in arguments)])
+    except SystemExit as stop:
+        code = stop.code
+    assert code == 2
+    printed = capsys.readouterr()
+    assert said.format(folder=folder) in printed.err
+    assert "Traceback" not in printed.err
+    assert sorted(folder.iterdir()) == before
+
+
+def test_an_empty_volume_has_no_optical_depth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(folder / "empty.vol"), "-o", str(folder / "image.exr"), "--optical-depth", "5"]) == 2
+    assert "empty.vol: the volume is empty, so no extinction gives it an optical depth of 5" in capsys.readouterr().err
