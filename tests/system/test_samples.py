@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from dataclasses import fields
 from pathlib import Path
 
@@ -58,9 +60,10 @@ def test_samples_carry_what_the_shard_says(dataset: Dataset) -> None:
     for row in range(50):
         i, k, m = (int(v[0]) for v in np.nonzero(shard.label == part.label[row]))
         gamma = np.arccos(np.clip(np.dot(shard.w[i].astype(float), shard.omega_sun[i, k]), -1, 1))
-        expected = (gamma, shard.g[i], 0, 1, shard.albedo[i, m], np.log1p(shard.tau_sun[i, k]))
+        expected = (gamma, *shard.phase[i], shard.albedo[i, m], np.log1p(shard.tau_sun[i, k]))
         np.testing.assert_allclose(part.aux[row], expected, rtol=1e-5, atol=1e-6)
         assert part.error[row] == shard.error[i, k, m]
+        assert np.array_equal(part.half[row], shard.half[i, k, m])
         stencil = Descriptor(Field(backend(), shard.volume, shard.scale)).stencils_numpy(
             shard.point[i : i + 1], shard.w[i : i + 1], shard.omega_sun[i, k][None]
         )
@@ -107,6 +110,14 @@ def test_angle_is_precise_where_view_and_sun_are_parallel() -> None:
         w = np.array([[0.0, 0.0, 1.0]], np.float32)
         sun = np.array([[np.sin(gamma), 0.0, np.cos(gamma)]], np.float32)
         assert angle_between(w, sun)[0] == pytest.approx(gamma, rel=1e-5, abs=1e-12)
+
+
+def test_a_truncated_shard_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(dataset.folder, tmp_path / "set")
+    path = tmp_path / "set" / dataset.shards[1].file
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match=re.escape(str(path))):
+        source(open_dataset(path.parent)).pool(0)
 
 
 def test_no_shards_is_an_input_error(dataset: Dataset) -> None:

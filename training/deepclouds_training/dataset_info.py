@@ -90,6 +90,7 @@ def _thinned(values: NDArray[np.generic]) -> NDArray[np.float64]:
 
 def _histograms(table: dict[str, NDArray[np.float64]], picture: Path) -> None:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     across = 4
     down = -(-len(table) // across)
@@ -101,9 +102,10 @@ def _histograms(table: dict[str, NDArray[np.float64]], picture: Path) -> None:
         if name in _LOGARITHMIC:
             values = values[values > 0]
             if values.size:
-                low, high = np.percentile(values, (0.1, 100)) * (0.9, 1.1)
+                low, high = np.percentile(values, (1, 100)) * (0.9, 1.1)
                 axes.hist(np.clip(values, low, None), np.geomspace(low, high, 60))
             axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())
         else:
             axes.hist(values, 60)
     with replacing(picture, ".png") as temporary:

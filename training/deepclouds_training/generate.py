@@ -84,6 +84,8 @@ def make_shard(
         return trace_walks_mitsuba(volume, scale, point[rows], w[rows], phase[rows], suns[rows], albedo[rows], walks, seed)
 
     walks = _walks(config, plan, trace, n, (config.suns, albedo.shape[1]))
+    if tracer == "mitsuba":
+        walks = np.maximum(GROUP, GROUP * np.round(config.volpath_walks * walks / GROUP)).astype(np.int64)
     # The two tracers must not share a seed: what is compared has to be independent.
     final, seed = (trace, plan.walk_seed) if tracer == "own" else (trace_volpath, plan.walk_seed ^ 1)
     try:
@@ -120,11 +122,11 @@ def make_shard(
 
 def _walks(config: GenerateConfig, plan: CloudPlan, trace: Tracer, n: int, labels_per_point: tuple[int, int]) -> NDArray[np.int64]:
     least, most = config.walks
-    if least == most:
-        return np.full(n, least)
     # Walks through a large cloud are long: fewer of them bound the cost of a shard.
     share = min(1.0, config.slow_size / plan.size)
     most = max(least, GROUP * round(most * share / GROUP))
+    if least == most:
+        return np.full(n, least)
     pilot = estimate(trace, np.full(n, config.pilot), labels_per_point, plan.pilot_seed)
     return needed_walks(pilot, config.target, config.meet == "every", least, most)
 

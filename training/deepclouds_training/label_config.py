@@ -52,6 +52,8 @@ class GenerateConfig(BaseModel):
     volpath_every
         one cloud in so many has points that share two suns, phase functions and albedos, so that ``--tracer mitsuba`` can label the
         same points; 0 for none.
+    volpath_walks
+        share of a point's walks that volpath is given for each of its labels: its walks serve one label each, and are slower.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -80,6 +82,7 @@ class GenerateConfig(BaseModel):
     inside: Share = 0.06
     anywhere: Share = 0.06
     volpath_every: Annotated[int, Field(ge=0)] = 0
+    volpath_walks: Annotated[float, Field(gt=0, le=1)] = 1.0
 
     @model_validator(mode="after")
     def _consistent(self) -> GenerateConfig:
