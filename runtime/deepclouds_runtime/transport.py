@@ -23,7 +23,7 @@ from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
 from deepclouds_runtime import stratified
 from deepclouds_runtime.lights import LightSource, Shade
 from deepclouds_runtime.scattering import MultipleScattering
-from deepclouds_runtime.scene import Sun
+from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
 
 # A sample that hides less than this of what is behind it is sent to the network with a probability in proportion, weighted up.

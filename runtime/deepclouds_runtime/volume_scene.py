@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
-from deepclouds_runtime.scene import CloudScene, check_depth, check_size, read_lights
+from deepclouds_runtime.scene import CloudScene, check_depth, check_size
+from deepclouds_runtime.scene_lights import read_lights
 
 _FOV = 30.0
 _MARGIN = 1.15

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.renderer import COLOURS, LAYERS, Renderer, RenderResult
-from deepclouds_runtime.scene import CloudScene, read_lights, surfaces_alone
+from deepclouds_runtime.scene import CloudScene, surfaces_alone
+from deepclouds_runtime.scene_lights import read_lights
 from numpy.typing import NDArray
 
 from deepclouds.volume import Volume

@@ -68,6 +68,7 @@ class Scene:
     noise: float = 0.01
     slack: float = 0.002
     scale: float = 4.0
+    clouds: tuple[str, ...] = ("",)
 
 
 FLOOR = (
@@ -75,6 +76,11 @@ FLOOR = (
     '<bsdf type="diffuse"/></shape>'
 )
 BASE = Scene()
+CLOUDS = (
+    '<scale value="0.8"/>',
+    '<rotate y="1" angle="40"/><scale value="0.5"/><translate x="-0.1" y="1.45" z="0.2"/>',
+    '<scale x="0.5" y="0.8" z="0.6"/><translate x="-1.5" y="-0.2" z="0.3"/>',
+)
 SCENES = {
     "orthographic": replace(BASE, camera=ORTHOGRAPHIC, light=SUN + CONSTANT),
     "thin lens": replace(BASE, camera=THINLENS),
@@ -85,6 +91,8 @@ SCENES = {
     "sun and sky": replace(BASE, light=SUNSKY.format(1)),
     "sun and sky, floor": replace(BASE, light=SUNSKY.format(0.2), surfaces=FLOOR),
     "sky without its sun": replace(BASE, light=SUNSKY.format(0)),
+    "three clouds": replace(BASE, clouds=CLOUDS, slack=0.005),
+    "three clouds, all orders": replace(BASE, clouds=CLOUDS, max_depth=-1, slack=0.005, spp=256),
     "two lobes, sun": replace(BASE, phase=TWO_LOBES),
     "two lobes, sky": replace(BASE, phase=TWO_LOBES, light=CONSTANT),
     "two lobes, all orders": replace(BASE, phase=TWO_LOBES, light=SUN, max_depth=-1, spp=256, noise=0.01, scale=3.0),
@@ -97,13 +105,17 @@ def _xml(scene: Scene) -> str:
         <integer name="max_depth" value="{scene.max_depth}"/><integer name="rr_depth" value="1000000"/>
       </integrator>
       {scene.camera.format(film=scene.film)}{scene.light}{scene.surfaces}
-      <shape type="cube"><bsdf type="null"/>
+      {"".join(_cloud(scene, turn) for turn in scene.clouds)}</scene>"""
+
+
+def _cloud(scene: Scene, turn: str) -> str:
+    return f"""<shape type="cube"><bsdf type="null"/><transform name="to_world">{turn}</transform>
         <medium type="heterogeneous" name="interior">
           <float name="scale" value="{scene.scale}"/><rgb name="albedo" value="1 0.8 0.5"/>{scene.phase}
           <volume type="gridvolume" name="sigma_t"><string name="filename" value="density.vol"/>
-            <transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/><scale value="2"/></transform></volume>
+            <transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/><scale value="2"/>{turn}</transform></volume>
         </medium>
-      </shape></scene>"""
+      </shape>"""
 
 
 @pytest.fixture(scope="module")

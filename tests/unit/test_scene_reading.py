@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from deepclouds_runtime.placement import box_transform, cube_transform, locate, orientations
-from deepclouds_runtime.scene import check_depth, read_scene
+from deepclouds_runtime.scene import CloudScene, check_depth, read_scene
 from deepclouds_runtime.sunsky import split
 
 from deepclouds.errors import InputError
@@ -179,12 +179,44 @@ def test_homogeneous_media(mi: Any, folder: Path) -> None:
     assert ball.volume.sample(np.array([[2, 0, 0], [2.95, 0, 0], [2.9, 0.6, 0]])).tolist() == [1, 1, 0]
 
 
+def test_several_clouds_share_a_grid(mi: Any, folder: Path) -> None:
+    """As much extinction as the media hold together, each where Mitsuba has it."""
+    turns = ["", '<rotate y="1" angle="40"/><scale value="0.7"/><translate x="3.2" y="1.4" z="0.3"/>', '<translate x="0" y="2" z="0"/>']
+    scene = load(mi, folder, "".join(cloud(turn) for turn in turns))
+    read = read_scene(scene)
+    assert "3 clouds" in read.notes[0]
+    single = [read_scene(load(mi, folder, cloud(turn))) for turn in turns]
+
+    def content(part: CloudScene) -> float:
+        return (
+            part.scale
+            * float(part.volume.density.sum(dtype=np.float64))
+            * abs(np.linalg.det(part.volume.to_world[:3, :3]))
+            / part.volume.density.size
+        )
+
+    assert content(read) == pytest.approx(sum(content(part) for part in single), rel=0.01)
+    middle = read.scale * read.volume.sample(np.random.default_rng(2).uniform(-1, 4, (4000, 3)))
+    points = np.random.default_rng(2).uniform(-1, 4, (4000, 3))
+    truth = sum(part.scale * part.volume.sample(points) for part in single)
+    np.testing.assert_allclose(middle.mean(), truth.mean(), rtol=0.02)
+    # Noise of one value a voxel is the hardest to resample.
+    assert np.corrcoef(middle, truth)[0, 1] > 0.95
+
+
+def test_boxes_that_touch_or_only_seem_to_overlap_are_apart(mi: Any, folder: Path) -> None:
+    edgewise = '<rotate y="1" angle="45"/><translate x="2.2" y="0" z="2.2"/>'
+    for turn in ('<translate x="2" y="0" z="0"/>', edgewise):
+        assert "2 clouds" in read_scene(load(mi, folder, cloud() + cloud(turn))).notes[0]
+
+
 def test_other_pixel_filters_are_noted(mi: Any, folder: Path) -> None:
     read = read_scene(load(mi, folder, cloud(), CAMERA.format(film='<rfilter type="gaussian"/>')))
     assert any("GaussianFilter" in note for note in read.notes)
     assert not read_scene(load(mi, folder, cloud())).notes
 
 
+AWAY = '<translate x="5" y="0" z="0"/>'
 BLEND = '<phase type="blendphase"><float name="weight" value="0.25"/>{0}{1}</phase>'
 LOBE = '<phase type="hg"><float name="g" value="{0}"/></phase>'
 ISOTROPIC = '<phase type="isotropic"/>'
@@ -217,7 +249,10 @@ def test_phase_functions_are_those_of_mitsuba(mi: Any, folder: Path, phase: str,
 
 REFUSED = {
     "no cloud": (SUN, "no shape has an interior medium"),
-    "two clouds": (cloud() + cloud('<translate x="5" y="0" z="0"/>'), "2 shapes have an interior medium"),
+    "two kinds of cloud": (cloud() + cloud(AWAY, phase=ISOTROPIC), "2 clouds with different phase"),
+    "two colours of cloud": (cloud() + cloud(AWAY, albedo=ALBEDO.replace("0.7", "0.6")), "2 clouds with different albedo"),
+    "clouds in each other": (cloud() + cloud('<rotate x="0.6" y="0" z="0.8" angle="30"/><translate x="2.1" y="0" z="0"/>'), "overlap"),
+    "clouds too far apart": (cloud() + cloud('<translate x="3000" y="2000" z="400"/>'), "fits into memory; render one cloud"),
     "glass around the medium": (cloud(bsdf='<bsdf type="dielectric"/>'), "needs the BSDF `null`"),
     "glass beside the cloud": (cloud() + '<shape type="sphere"><bsdf type="dielectric"/></shape>', "lets light through"),
     "mask": (cloud() + '<shape type="sphere"><bsdf type="mask"><bsdf type="diffuse"/></bsdf></shape>', "lets light through"),
