@@ -27,8 +27,12 @@ def test_list_names_every_family_and_parameter(capsys: pytest.CaptureFixture[str
 
 
 def test_list_measures_on_request(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("list", "--statistics", 1, "--resolution", 16) == 0
-    assert capsys.readouterr().out.count("measured on 1 clouds at 16") == len(FAMILIES)
+    assert run("list", "stratus", "shapes", "--statistics", 2, "--resolution", 16) == 0
+    text = capsys.readouterr().out
+    assert text.count("measured on 2 clouds at 16") == 2
+    assert "cumulus" not in text
+    for quantity in ("cover", "chi", "nu", "slope", "outline", "mean_to_max", "filled", "aspect"):
+        assert text.count(f"        {quantity} ") == 2
 
 
 def test_make_writes_the_cloud_that_the_function_makes(tmp_path: Path) -> None:
@@ -55,6 +59,18 @@ def test_preview_draws_a_row_a_family(tmp_path: Path) -> None:
     assert pixels.shape[1] >= 80
     # Sky and cloud: a sheet of one colour shows nothing.
     assert pixels.std() > 10
+
+
+def test_preview_into_a_folder_draws_a_sheet_a_family_with_a_view_from_above(tmp_path: Path) -> None:
+    from PIL import Image
+
+    assert run("preview", "stratocumulus", "shapes", "-o", tmp_path / "new", "--count", 1, "--resolution", 16, "--size", 40) == 0
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["clouds_shapes.png", "clouds_stratocumulus.png"]
+    with Image.open(tmp_path / "new" / "clouds_shapes.png") as image:
+        pixels = np.asarray(image.convert("RGB")).astype(np.float64)
+    # The sea behind the view from above is darker than the sky, at the bottom left of both pictures.
+    half = pixels.shape[0] // 2
+    assert pixels[-8, 6].sum() < pixels[half - 8, 6].sum()
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,9 @@ from deepclouds_training.clouds._parcel import condensation, entrainment
 from deepclouds_training.clouds._raster import Field, Grid
 from deepclouds_training.clouds._turrets import Balls, distance, extent
 
+# Gain of an octave that gives outlines the dimension 4/3 of real cumuli (Lovejoy 1982): 2 ** -(2 - 4 / 3).
+_ROUGH = 2 ** (-2 / 3)
+
 
 @dataclass(frozen=True, kw_only=True)
 class HeapParameters(CloudParameters):
@@ -44,7 +47,7 @@ def heap(balls: Balls, parameters: HeapParameters, streams: Streams, turret: flo
 
     def evaluate(grid: Grid) -> Array:
         depth = -distance(grid, balls, 1.3 * bulge + 0.1 * turret)
-        depth += np.float32(2 * bulge) * (knobs.octaves(grid, 1.6 / turret, 4, 0.55) - np.float32(0.5))
+        depth += np.float32(2 * bulge) * (knobs.octaves(grid, 1.6 / turret, 5, _ROUGH) - np.float32(0.5))
         noise = ragged.octaves(grid, 0.9 / turret, 6, 0.62)
         # Erosion bites in patches: where the slow noise is low nothing happens, so crisp and frayed edges stand side by side.
         depth -= np.float32(0.2 * turret * parameters.erosion) * np.maximum(noise, 0)

@@ -44,7 +44,7 @@ def fade(grid: Grid, depth: float, ragged: SmoothNoise) -> Array:
     side = np.minimum(0.5 - np.abs(x), depth / 2 - np.abs(z))
     inset = side + np.float32(0.09) * ragged.octaves(sheet(grid), 2.5, 6, 0.6) - np.float32(0.09)
     # However ragged, the layer ends before the sides.
-    return smoothstep(0.0, 0.2, np.minimum(inset, 2 * side))
+    return smoothstep(0.0, 0.12, np.minimum(inset, 2 * side))
 
 
 def layer(grid: Grid, column: Array, thickness: float, noise: Array, foot: float, sag: float, roughness: float = 0.12) -> Array:

@@ -89,7 +89,9 @@ def rasterise(field: Field, resolution: int, voxel_aspect: float) -> Volume | No
     lower, upper = np.array(field.lower, np.float64), np.array(field.upper, np.float64)
     cut = np.array(field.cut)
     if not cut.all():
-        scout = Grid.over(lower, upper, _counts(upper - lower, np.ones(3), _SCOUT))
+        # A body that is a number of voxels thick must not look thinner here than on the grid itself.
+        finest = _SCOUT if field.averaged else min(_SCOUT, resolution)
+        scout = Grid.over(lower, upper, _counts(upper - lower, np.ones(3), finest))
         density = _sharpen(field.evaluate(scout), field)
         if density is None:
             return None

@@ -29,7 +29,7 @@ class CloudStatistics:
     slope
         exponent of the power spectrum of tau along the rows of the plan, for waves from a third of the box to 8 voxels.
     outline
-        dimension of the outline of the plan view, from its length seen in blocks of 1, 2 and 4 voxels: 1 for a smooth one.
+        dimension of the outline of the plan view, from its length seen in blocks of 2, 4 and 8 voxels: 1 for a smooth one.
     mean_to_max
         extinction-weighted mean density over the maximum.
     filled
@@ -97,7 +97,7 @@ def outline_dimension(columns: NDArray[np.float64], threshold: float) -> float:
 
     Sides of blocks count, so that a smooth outline of any form has the dimension 1. NaN where there is no outline.
     """
-    lengths, blocks = [], (1, 2, 4)
+    lengths, blocks = [], (2, 4, 8)
     for side in blocks:
         m, n = (k // side for k in columns.shape)
         if min(m, n) < 4:

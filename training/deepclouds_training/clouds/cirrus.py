@@ -25,7 +25,7 @@ class CirrusParameters(CloudParameters):
     fibres: float = number(6.0, 20.0, "bundles of fibres across the wind", log=True)
     cover: float = number(0.15, 0.6, "share of the generating level that holds cells")
     tangle: float = number(0.0, 1.0, "how far eddies bend the fibres")
-    mean_to_max: float = number(0.2, 0.5, "extinction-weighted mean density over the maximum")
+    mean_to_max: float = number(0.3, 0.6, "extinction-weighted mean density over the maximum")
 
 
 def build(parameters: CirrusParameters, streams: Streams) -> Field:

@@ -191,6 +191,7 @@ def _sheet(parameters: ShapesParameters, turn: Array) -> Field:
         body = np.clip(np.float32(0.5 * parameters.voxels + 0.5) - off / across, 0, 1)
         return np.asarray(body * ((np.abs(px) <= 1) & (np.abs(pz) <= 1)), np.float32)
 
-    half = np.array([1.0, max(0.5 * parameters.curve, 0.0) + 0.15, 1.0])
+    # Four voxels of the coarsest grid are two thirds as thick as the sheet is wide.
+    half = np.array([1.0, 0.5 * parameters.curve + 0.8, 1.0])
     reach = np.abs(turn.T) @ half
     return Field(tuple(-reach), tuple(reach), thin, averaged=False)

@@ -21,7 +21,7 @@ class StratocumulusParameters(LayerParameters):
     coverage: float = number(0.6, 1.0, "share of the sky that is covered", usual=1.0, usual_share=0.25)
     cells: float = number(3.0, 14.0, "cells across the width", log=True)
     rolls: float = number(1.0, 4.0, "length of a cell over its width", log=True, usual=1.0, usual_share=0.5)
-    variability: float = number(0.5, 1.0, "deviation of the logarithm of a column's optical depth")
+    variability: float = number(0.35, 0.8, "deviation of the logarithm of a column's optical depth")
 
 
 def build(parameters: StratocumulusParameters, streams: Streams) -> Field:
