@@ -47,6 +47,8 @@ class Majorants:
         (bz, by, bx) largest extinction in that block.
     empty_radius
         (bz, by, bx) the same for the largest block without extinction; -1 where the brick itself has some.
+    any_empty
+        whether a brick is empty.
 
     Notes
     -----
@@ -62,6 +64,7 @@ class Majorants:
             self.bricks = np.clip(np.round(brick * voxel_size.min() / voxel_size), 1, shape).astype(int)
         self.bound = _brick_maxima(sigma, self.bricks)
         self.radius, self.block_bound, self.empty_radius = _choose_blocks(self.bound, self.bricks * voxel_size)
+        self.any_empty = bool(np.any(self.empty_radius >= 0))
         count = self.bound.shape[::-1]
         self._types = types
         self._table = types.Float(np.stack([self.block_bound, self.radius], axis=-1).astype(np.float32).ravel())
@@ -102,11 +105,16 @@ class Majorants:
         reached = distance - dr.log(1 - u) / dr.maximum(majorant, 1e-30)
         return dr.maximum(dr.minimum(reached, end), distance), reached < end, majorant
 
-    def empty_until(self, at: Any, origin: Any, along: Any) -> Any:
-        """Distance from `origin` along the ray up to which it is empty from `at` on; -inf where the brick at `at` is not."""
-        cell, index = self._brick(at)
-        radius = dr.gather(self._types.Float, self._empty, index)
-        return dr.select(radius >= 0, self._exit(cell, radius, origin, along), -np.inf)
+    def empty(self, at: Any, active: Any) -> tuple[Any, Any]:
+        """Whether the bricks at `at`, points in the unit cube of the box, are empty, and the radii of their empty blocks for `end`."""
+        _, index = self._brick(at)
+        radius = dr.gather(self._types.Float, self._empty, index, active)
+        return active & (radius >= 0), radius
+
+    def end(self, at: Any, radius: Any, origin: Any, along: Any) -> Any:
+        """Distance from `origin` along the ray at which the block of `radius` around the brick at `at` ends; see `step`."""
+        cell, _ = self._brick(at)
+        return self._exit(cell, radius, origin, along)
 
     def _brick(self, at: Any) -> tuple[list[Any], Any]:
         cell = [dr.clip(dr.floor(v * n), 0, last) for v, n, last in zip(at, self._per_unit, self._last, strict=True)]

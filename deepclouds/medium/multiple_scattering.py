@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from deepclouds.medium.field import Field
 from deepclouds.medium.phase import as_lobes, hg, rotate_to, sample_hg_cosine, sample_two_lobe_cosine, two_lobe
 
+# Lanes begin walks at every so many steps.
+_TURN = 4
+
 
 def trace_walks(
     field: Field,
@@ -151,9 +154,12 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
     albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
 
+    clock = dr.zeros(UInt32, lanes)
+
     while alive:
-        if ended:
-            # Take the next walk; a lane retires when none is left.
+        # To take the next walk costs as much as several steps, and lanes run in step with each other: those that have ended wait for a
+        # common turn. A lane retires when no walk is left.
+        if ended & (clock % _TURN == 0):
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
             point = number // walks_each
@@ -177,6 +183,8 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
             pending = UInt32(0)
             ended = Bool(False)
 
+        clock += 1
+        traced = alive & ~ended
         shadow = pending != 0
         lowest = pending & (~pending + 1)
         sun = suns[0]
@@ -187,14 +195,14 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         rng, u_step = _uniform(types, rng)
         rng, u_event = _uniform(types, rng)
         along = field.direction_to_unit(heading)
-        distance, tentative, majorant = field.majorants.step(position, along, distance, u_step, alive)
+        distance, tentative, majorant = field.majorants.step(position, along, distance, u_step, traced)
         unit = dr.fma(along, distance, position)
-        inside = alive & field.holds_unit(unit)
+        inside = traced & field.holds_unit(unit)
         sigma = field.sigma_t_unit(unit, inside & tentative)
         hit = inside & tentative & (u_event * majorant < sigma)
 
         collision = hit & ~shadow
-        connected = shadow & ~inside
+        connected = traced & shadow & ~inside
         value = dr.select(connected, dr.maximum(4 * np.pi * _phase(lobes, dr.dot(direction, sun)), least), 0)
         # A walk's results are its lane's alone.
         first = (number * k_suns + dr.popcnt(lowest - 1)) * m_albedos
@@ -219,4 +227,4 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         direction = dr.select(turn, rotate_to(direction, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth), direction)
         for m in range(m_albedos):
             weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
-        ended = alive & ~inside & ~shadow
+        ended |= traced & ~inside & ~shadow

@@ -1,7 +1,7 @@
 """Optical depth along straight segments, by a jittered midpoint march with steps of half a voxel.
 
 A trilinear field is smooth inside a cell, so the march errs far less than any tabulated transmittance; the jitter makes it unbiased
-in tau. In a homogeneous box it is exact.
+in tau. In a homogeneous box it is exact. Runs of steps in empty bricks are left out: they would add zeros.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ def optical_depth(
     index = dr.zeros(types.Float, dr.width(steps))
     going = active & (steps > 0)
     while going:
-        distance = first + (index + jitter) * width
-        tau += width * field.sigma_t_unit(dr.fma(along, distance, base), going)
-        index += 1
+        at = dr.fma(along, first + (index + jitter) * width, base)
+        empty, step = _empty_steps(field, at, base, along, first, width, index, jitter, going)
+        tau += width * field.sigma_t_unit(at, going & ~empty)
+        index += step
         going = going & (index < steps) & (tau < opaque)
     return tau
 
@@ -64,16 +65,34 @@ def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any,
     going = active & (steps > 0)
     while going:
         near = first + index * width
-        sigma = field.sigma_t_unit(dr.fma(along, near + jitter * width, base), going)
+        at = dr.fma(along, near + jitter * width, base)
+        # A target that is reached already lies at the end of the first step.
+        empty, step = _empty_steps(field, at, base, along, first, width, index, jitter, going & (tau < target))
+        sigma = field.sigma_t_unit(at, going & ~empty)
         reached = tau + width * sigma
         inside = reached >= target
-        fraction = dr.select(inside & (sigma > 0), (target - tau) / (sigma * width), 1.0)
-        found = dr.select(going, near + dr.clip(fraction, 0, 1) * width, found)
+        fraction = dr.select(inside & (sigma > 0), dr.clip((target - tau) / (sigma * width), 0, 1), dr.minimum(step, steps - index))
+        found = dr.select(going, near + fraction * width, found)
         density = dr.select(going, sigma, density)
         tau = reached
-        index += 1
+        index += step
         going = going & (index < steps) & ~inside
     return found, density
+
+
+@dr.syntax
+def _empty_steps(
+    field: Field, at: Any, base: Any, along: Any, first: Any, width: Any, index: Any, jitter: Any, active: Any
+) -> tuple[Any, Any]:
+    """Whether step `index`, which reads `at`, lies in an empty brick, and the number of steps to the next that may read something."""
+    types = field.types
+    empty, step = types.Bool(False), types.Float(1)
+    if dr.hint(field.majorants.any_empty, mode="scalar"):
+        empty, radius = field.majorants.empty(at, active)
+        if empty:
+            end = field.majorants.end(at, radius, base, along)
+            step = dr.maximum(dr.ceil((end - first) / width - jitter) - index, 1)
+    return empty, step
 
 
 def _march(field: Field, origin: Any, direction: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:

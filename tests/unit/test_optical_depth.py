@@ -141,6 +141,29 @@ def test_distance_at_is_exact_in_a_homogeneous_box_and_ends_beyond_the_target() 
     np.testing.assert_allclose(np.array(beyond), 3, rtol=1e-6)
 
 
+def test_leaving_out_empty_bricks_changes_nothing() -> None:
+    """Against the plain march, whose one brick is never empty: the same depths to the bit, the same distances but for rounding."""
+    density = np.zeros((30, 41, 26), np.float32)
+    rng = np.random.default_rng(13)
+    for _ in range(20):
+        at = [int(rng.integers(0, n - 4)) for n in density.shape]
+        density[tuple(slice(a, a + 4) for a in at)] = rng.random((4, 4, 4))
+    v, n = Volume.from_box(density, (-1, -2, 0.5), (1.5, 1, 2)), 20_000
+    o, d = rays(n, 14)
+    jitter, start, end = rng.random(n), rng.choice([0.0, 2.0, 6.0], n), rng.choice([5.0, 7.0, FAR], n)
+    plain, skipping = Field(backend(), v, 8.0, brick=None), Field(backend(), v, 8.0)
+    assert not plain.majorants.any_empty
+    assert (skipping.majorants.empty_radius >= 1).mean() > 0.2
+    depths = [march(f, o, d, start=start, end=end, jitter=jitter) for f in (plain, skipping)]
+    assert np.count_nonzero(depths[0]) > 2000
+    np.testing.assert_array_equal(depths[1], depths[0])
+    target = rng.choice([0.0, 0.3, 0.999, 2.0], n) * depths[0] + rng.choice([0.0, 1e-3], n)
+    arguments = device(o), device(d), device(start), device(end), device(jitter), device(target), backend().Bool(np.ones(n, bool))
+    (first, density_first), (second, density_second) = (distance_at(f, *arguments) for f in (plain, skipping))
+    np.testing.assert_allclose(np.array(second), np.array(first), rtol=1e-6)
+    np.testing.assert_array_equal(np.array(density_second), np.array(density_first))
+
+
 def test_beer_lambert() -> None:
     """Delta tracking leaves exp(-tau) of the rays, and places collisions so that 1 - exp(-tau(x)) is uniform."""
     v, n = volume(), 40_000
