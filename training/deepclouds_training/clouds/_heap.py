@@ -23,7 +23,7 @@ class HeapParameters(CloudParameters):
     billow: float = number(0.3, 1.0, "height of the cauliflower knobs on the turrets")
     erosion: float = number(0.0, 0.8, "how far dry air eats into the edges, in ragged patches")
     softness: float = number(0.02, 0.2, "width of the edge over the size of a turret", log=True)
-    mean_to_max: float = number(0.3, 0.75, "extinction-weighted mean density over the maximum")
+    mean_to_max: float = number(0.24, 0.75, "extinction-weighted mean density over the maximum", log=True)
 
 
 def heap(balls: Balls, parameters: HeapParameters, streams: Streams, turret: float, foot: float = 0.3, lid: float = np.inf) -> Field:

@@ -62,7 +62,7 @@ def build(parameters: CumulonimbusParameters, streams: Streams) -> Field:
         anvil = np.float32(parameters.anvil_density) * edge * thin * np.exp(np.float32(0.45) * streaks)
         return np.maximum(body.evaluate(grid), anvil.astype(np.float32))
 
-    reach = (middle - 1.4 * up, top - 3 * thick, -1.6 * half_z), (middle + 1.35 * down, top + 0.3 * thick, 1.6 * half_z)
+    reach = (middle - 1.5 * up, top - 3 * thick, -1.9 * half_z), (middle + 1.5 * down, top + 0.3 * thick, 1.9 * half_z)
     return replace(
         body,
         lower=tuple(np.minimum(body.lower, reach[0])),
