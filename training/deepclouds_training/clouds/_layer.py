@@ -62,8 +62,9 @@ def layer(grid: Grid, column: Array, thickness: float, noise: Array, foot: float
         share of the local thickness that hangs below y = 0; 0 for a flat base.
     """
     # Extinction that grows as the power 2/3 of height sums up to the power 5/3 of the thickness.
-    local = np.float32(thickness) * column ** np.float32(0.6)
+    local = np.asarray(np.float32(thickness) * column ** np.float32(0.6), np.float32)
     above = grid.open()[1] + np.float32(sag) * local + np.float32(roughness) * noise * local
     inner = np.minimum(above, local - above)
     edge = smoothstep(0.0, 0.15 * thickness, inner)
-    return np.asarray(edge * condensation(above / np.float32(thickness * 1.5), foot) * np.exp(np.float32(0.2) * noise), np.float32)
+    wet = condensation(np.asarray(above / np.float32(1.5 * thickness), np.float32), foot)
+    return np.asarray(edge * wet * np.exp(np.float32(0.2) * noise), np.float32)

@@ -60,7 +60,7 @@ def build(parameters: CumulonimbusParameters, streams: Streams) -> Field:
         edge = smoothstep(0.0, 0.3 * thick, depth + np.float32(0.06 * thick) * streaks * np.minimum(local * 4, 1)) * (local > 0)
         thin = np.clip(1 - np.float32(0.6) * away, 0.2, 1) * smoothstep(0.0, 0.5, 1 - away + np.float32(0.08) * streaks)
         anvil = np.float32(parameters.anvil_density) * edge * thin * np.exp(np.float32(0.45) * streaks)
-        return np.maximum(body.evaluate(grid), anvil.astype(np.float32))
+        return np.asarray(np.maximum(body.evaluate(grid), anvil), np.float32)
 
     reach = (middle - 1.5 * up, top - 3 * thick, -1.9 * half_z), (middle + 1.5 * down, top + 0.3 * thick, 1.9 * half_z)
     return replace(

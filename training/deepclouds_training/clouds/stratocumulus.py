@@ -40,7 +40,7 @@ def build(parameters: StratocumulusParameters, streams: Streams) -> Field:
         x, _, z = grid.open()
         bend = 0.35 / parameters.cells
         wx, wz = (np.float32(bend) * w.octaves(plane, parameters.cells, 5, 0.55) for w in warps)
-        wall = cells.wall((x + wx) / np.float32(parameters.rolls), z + wz)
+        wall = cells.wall(np.asarray((x + wx) / np.float32(parameters.rolls), np.float32), z + wz)
         plan = np.float32(0.75) * sign * wall + np.float32(0.66) * swells.octaves(plane, 2.0, 9, KOLMOGOROV)
         column = covered(np.float32(parameters.variability) * plan, parameters.coverage)
         if not cut:
