@@ -27,10 +27,11 @@ def mitsuba(select: bool = False) -> ModuleType:
     InputError
         when no variant is set (and `select` is false), or one that is not in `VARIANTS`.
     """
-    backend("llvm")  # finds the LLVM library before Mitsuba looks for it, and says what to install where there is none
     import mitsuba as mi
 
     if mi.variant() is None and select:
+        # It finds the LLVM library before Mitsuba looks for it, and says what to install where there is none.
+        backend("llvm")
         mi.set_variant(DEFAULT_VARIANT)
     if mi.variant() not in VARIANTS:
         raise InputError(
