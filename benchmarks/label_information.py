@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -66,13 +67,18 @@ class Labels:
     label: Doubles
     seconds: float
 
+    @cached_property
+    def descriptor(self) -> Descriptor:
+        """Of the field; its filtered levels are made once."""
+        return Descriptor(self.field)
+
     def inputs(self, rows: NDArray[np.int64], rng: Generator) -> tuple[Singles, Singles]:
         """Stencils (m, 10, 225) and aux rows (m, 6) of the labels `rows`."""
         p, w, sun = self.points[rows], self.w[rows], self.sun[rows]
         t, n = self.field.types, len(rows)
         o, d = (t.Array3f(np.ascontiguousarray(v.T)) for v in (p, sun))
         tau = optical_depth(self.field, o, d, t.Float(0), t.Float(1e30), t.Float(0.5), t.Bool(np.ones(n, bool)))
-        stencil = Descriptor(self.field).stencils_numpy(p, w, sun, rng.uniform(0, 2 * np.pi, n))
+        stencil = self.descriptor.stencils_numpy(p, w, sun, rng.uniform(0, 2 * np.pi, n))
         return stencil, aux_inputs(angle_between(w, sun), self.g[rows], 0.0, 1.0, self.albedo[rows], np.array(tau))
 
 
@@ -163,6 +169,16 @@ def validation_labels(field: Field, points: int, walks: int, seed: int) -> tuple
 
 def train(sets: list[Labels], steps: int, seed: int, batch: int = 1024, reuse: int = 4) -> Network:
     """A network of width 32 after `steps` steps of Adam on the sets of all clouds in equal parts, its weights averaged."""
+    threads = torch.get_num_threads()
+    # Two threads that wait for each other cost more on so small a network than they save.
+    torch.set_num_threads(1)
+    try:
+        return _train(sets, steps, seed, batch, reuse)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(sets: list[Labels], steps: int, seed: int, batch: int, reuse: int) -> Network:
     rng = np.random.default_rng([seed, 4])
     torch.manual_seed(seed)
     network = Network(NetworkConfig(width=32))
@@ -191,7 +207,7 @@ def train(sets: list[Labels], steps: int, seed: int, batch: int = 1024, reuse: i
 
 
 @torch.no_grad()
-def judge(network: Network, valid: list[tuple[Labels, Doubles]]) -> tuple[float, float]:
+def judge(network: torch.nn.Module, valid: list[tuple[Labels, Doubles]]) -> tuple[float, float]:
     """Relative RMS error free of the labels' noise, root mean square over the clouds, and the relative error of the mean."""
     squares, energies = [], []
     for number, (first, second) in enumerate(valid):
