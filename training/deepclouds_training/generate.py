@@ -222,7 +222,7 @@ def generate(
 def _clouds(plans: Sequence[CloudPlan]) -> Iterator[tuple[CloudPlan, Volume]]:
     """Every plan with its cloud, made ahead on other processes."""
     queue: dict[int, Future[Volume]] = {}
-    with ProcessPoolExecutor(_MAKERS, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(_MAKERS, len(plans)), mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             for place, plan in enumerate(plans):
                 for ahead in plans[place : place + 1 + _AHEAD]:

@@ -161,7 +161,8 @@ class SampleSource:
         """The labels at the `chosen` points, suns and albedos of a shard, with their stencils."""
         i, k, m = chosen
         w, sun = shard.w[i], shard.omega_sun[i, k]
-        aux = aux_inputs(angle_between(w, sun), *shard.phase[i].T, shard.albedo[i, m], shard.tau_sun[i, k])
+        g1, g2, weight = shard.phase[i].T
+        aux = aux_inputs(angle_between(w, sun), g1, g2, weight, shard.albedo[i, m], shard.tau_sun[i, k])
         half, error = shard.half[i, k, m], shard.error[i, k, m]
         label = half.mean(axis=-1)
         if not (np.all(np.isfinite(label)) and np.all(np.isfinite(error)) and np.all(np.isfinite(stencil))):
