@@ -199,7 +199,7 @@ def _train(sets: list[Labels], steps: int, seed: int, batch: int, reuse: int) ->
         prediction = network(torch.from_numpy(stencil[mine]), torch.from_numpy(aux[mine]))
         loss = relative_squared_error(prediction, torch.from_numpy(label[mine]))
         optimiser.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
         average.update()
@@ -216,7 +216,7 @@ def judge(network: torch.nn.Module, valid: list[tuple[Labels, Doubles]]) -> tupl
         mean = 0.5 * float(first.label.mean() + second.mean())
         squares.append(float(np.mean((prediction - first.label) * (prediction - second))) / mean**2)
         energies.append(float(prediction.mean()) / mean - 1)
-    return float(np.sqrt(max(0.0, np.mean(squares)))), float(np.mean(energies))
+    return max(0.0, float(np.mean(squares))) ** 0.5, float(np.mean(energies))
 
 
 def information(effort: Effort, seed: int = 11) -> dict[str, Worth]:
