@@ -72,6 +72,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument("--no-interreflection", action="store_true", help="leave out the light that surfaces and cloud throw on each other")
     parser.add_argument("--png", metavar="FILE", nargs="?", const="", help="also write a tone-mapped preview (default name: OUT.png)")
     parser.add_argument("--exposure", type=float, default=0.0, help="of the preview, in stops (default %(default)s)")
+    parser.add_argument("--variant", metavar="NAME", help="Mitsuba's variant, such as cuda_ad_rgb (default llvm_ad_rgb)")
     parser.add_argument("--threads", type=_positive, help="threads to use (default: all cores)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--multiple", choices=("network", "walks"), default="network", help=argparse.SUPPRESS)
@@ -129,11 +130,13 @@ def run(argv: Sequence[str], prog: str) -> int:
 
     import numpy as np
 
-    from deepclouds_runtime._mitsuba import mitsuba
+    from deepclouds_runtime._mitsuba import mitsuba, select
     from deepclouds_runtime.loading import load
     from deepclouds_runtime.output import check_exposure, save
 
     check_exposure(arguments.exposure)
+    if arguments.variant is not None:
+        select(arguments.variant)
     defines = dict(_define(text) for text in arguments.defines)
     renderer = load(arguments.input, defines=defines, model=arguments.model, threads=arguments.threads, **options, **how)
     say: Callable[[str], None] = (lambda text: None) if arguments.quiet else print

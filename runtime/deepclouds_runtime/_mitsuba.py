@@ -42,6 +42,16 @@ def mitsuba(select: bool = False) -> ModuleType:
     return module
 
 
+def select(variant: str) -> None:
+    """Set Mitsuba's variant for the whole process; raises InputError for one that we do not run in, or that this machine cannot run."""
+    if variant not in VARIANTS:
+        raise InputError(f"variant '{variant}': there are {', '.join(VARIANTS)}")
+    backend(variant.partition("_")[0])
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+
+
 def types_of(mi: Any) -> ModuleType:
     """``drjit.llvm`` or ``drjit.cuda``, to go with Mitsuba's current variant."""
     return backend(str(mi.variant()).partition("_")[0])

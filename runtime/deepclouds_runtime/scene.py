@@ -101,7 +101,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     _check_camera_medium(camera, containers)
     media = [read_medium(container) for container in containers]
     medium = media[0] if len(media) == 1 else merged(media, notes)
-    lights = read_lights(scene)
+    lights = read_lights(scene.emitters())
     notes.extend(lights.notes)
     integrator = scene.integrator()
     if max_depth is None:

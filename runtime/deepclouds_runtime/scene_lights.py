@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,13 +34,13 @@ class SceneLights:
     notes: tuple[str, ...]
 
 
-def read_lights(scene: Any) -> SceneLights:
-    """All lights of a Mitsuba scene; raises InputError for lights of other kinds."""
+def read_lights(emitters: Iterable[Any]) -> SceneLights:
+    """Tell the Mitsuba emitters of a scene apart; raises InputError for lights of other kinds."""
     mi = mitsuba()
     suns: list[Sun] = []
     notes: list[str] = []
     environment = backdrop = None
-    for emitter in scene.emitters():
+    for emitter in emitters:
         kind = emitter.class_name()
         if kind == "DirectionalEmitter":
             sample, irradiance = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))

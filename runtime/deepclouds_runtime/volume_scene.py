@@ -107,12 +107,14 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
     mi = mitsuba()
     scale = extinction(volume, options, source)
     try:
-        scene = mi.load_dict(description(volume, options))
+        # One by one: a scene around them would ask a GPU for its ray tracer.
+        parts = {name: mi.load_dict(part) for name, part in description(volume, options).items() if name != "type"}
     except RuntimeError as error:
         if "envmap" in str(error):
             raise InputError(f"{options.env}: not an environment map that Mitsuba reads; give a latitude-longitude .exr or .hdr") from error
         raise InputError(f"{source}: Mitsuba cannot build the scene around it ({error})") from error
-    lights = read_lights(scene)
+    camera = parts.pop("camera")
+    lights = read_lights(parts.values())
     channels = len(mi.Spectrum())
     albedo = _three(options.albedo) if channels == 3 else (float(np.dot(_three(options.albedo), (0.2126, 0.7152, 0.0722))),)
     return CloudScene(
@@ -123,7 +125,7 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
         lights.suns,
         lights.environment,
         None,
-        scene.sensors()[0],
+        camera,
         options.hide_emitters,
         check_depth(options.max_depth),
         backdrop=lights.backdrop,

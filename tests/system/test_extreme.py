@@ -127,7 +127,7 @@ def _render(mi: Any, case: Case) -> RenderResult:
         shape.setdefault("bsdf", {"type": "twosided", "inner": {"type": "diffuse"}})
         description["surface"] = shape
     scene = mi.load_dict(description)
-    lights = read_lights(scene)
+    lights = read_lights(scene.emitters())
     read = CloudScene(
         volume,
         case.optical_depth / line if line > 0 else 1.0,

@@ -44,6 +44,7 @@ CHANGING = {
 # Values that do not: they choose how, name what is chosen anyway, or concern surfaces and files that this cloud does not have.
 KEEPING = {
     "--threads": ["2"],
+    "--variant": ["llvm_ad_rgb"],
     "--quiet": [],
     "--grid": ["density"],
     "--clamp": [],
@@ -128,6 +129,7 @@ def test_good_values_show(folder: Path) -> None:
         (["--grid", "flames"], "no grid called 'flames'. Grids: density"),
         (["--sensor", "1"], "the option 'sensor' belongs to a scene"),
         (["-Dx=1"], "-Dx has no meaning for a volume"),
+        (["--variant", "scalar_rgb"], "variant 'scalar_rgb': there are llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb, cuda_ad_mono"),
         (["--threads", "0"], "--threads: '0' is not a whole number above 0"),
         (["--exposure", "inf", "--png"], "exposure = inf: give stops between"),
         (["--png", "{folder}/x.jpg"], "x.jpg: the name must end in .png"),

@@ -59,6 +59,15 @@ def test_the_plugin_is_registered_in_every_variant_and_refuses_in_the_others(mon
         made[f"llvm_ad_spectral {NAME}"](None)
 
 
+def test_a_gpu_that_is_not_there_is_named() -> None:
+    import drjit as dr
+
+    if dr.has_backend(dr.JitBackend.CUDA):
+        pytest.skip("there is a CUDA device on this machine")
+    with pytest.raises(InputError, match="'cuda' is not available: install the NVIDIA driver"):
+        _mitsuba.select("cuda_ad_rgb")
+
+
 def test_the_plugin_loads_on_a_gpu() -> None:
     import drjit as dr
     import mitsuba as mi
