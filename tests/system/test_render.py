@@ -194,7 +194,7 @@ def test_every_different_albedo_is_asked_once(folder: Path) -> None:
 def test_two_lobes_reach_the_network(folder: Path) -> None:
     network = Constant()
     load(folder / "density.vol", predictor=network, phase=(0.8, -0.3, 0.7), size=(8, 8)).render(1)
-    assert np.all(np.concatenate(network.aux)[:, 1:4] == np.float32((0.8, -0.3, 0.7)))
+    assert np.all(np.concatenate(network.aux)[:, 1:4] == np.array((0.8, -0.3, 0.7), np.float32))
 
 
 def test_a_constant_network_gives_the_known_radiance(folder: Path) -> None:
