@@ -211,7 +211,7 @@ def check_image(mi: Any, name: str, g: float, albedo: float, sun: Singles, seeds
 
 @pytest.mark.parametrize(("name", "g", "albedo", "sun"), [("cloud", 0.85, 1.0, SIDE), ("cube", 0.6, 0.9, BEHIND)])
 def test_images(mi: Any, name: str, g: float, albedo: float, sun: Singles) -> None:
-    check_image(mi, name, g, albedo, sun, seeds=16, spp=48)
+    check_image(mi, name, g, albedo, sun, seeds=24, spp=48)
 
 
 @pytest.mark.slow
