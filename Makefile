@@ -21,7 +21,7 @@ NATIVE := CMakeLists.txt $(wildcard deepclouds/volume/native/*)
 .NOTPARALLEL:
 .SILENT:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-reference test check bench train-model setup setup-test setup-bench setup-train clean
+.PHONY: help demo demo-reference test check bench bench-labels labels train-model setup setup-test setup-bench setup-train clean
 
 help:
 	echo "make demo            render the demo cloud"
@@ -29,6 +29,8 @@ help:
 	echo "make test            all tests (TESTS='tests/unit -k vdb' for some)"
 	echo "make check           style and types"
 	echo "make bench           run time against error (SCENES=folder for other scenes)"
+	echo "make bench-labels    cost of training labels beside Mitsuba's volpath"
+	echo "make labels          the labels to train on and those to judge by; run again after an interruption, it goes on"
 	echo "make train-model     labels, training and export of the model; run again after an interruption, it goes on"
 	echo "make setup           the installation alone; setup-test, setup-bench, setup-train add their packages"
 	echo "make clean           remove .venv and build"
@@ -52,14 +54,21 @@ bench: setup-bench
 
 # Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
-	$(BIN)/deepclouds generate configs/first_labels.toml -o work/first
-	$(BIN)/deepclouds generate configs/first_coarse_labels.toml -o work/first_coarse
-	[ -e work/first_all ] || $(BIN)/deepclouds dataset merge work/first work/first_coarse -o work/first_all
-	for run in first first_finish; do \
-	  if [ -e work/$${run}_run/checkpoint.pt ]; then how=--resume; else how=configs/$$run.toml; fi; \
-	  $(BIN)/deepclouds train $$how -o work/$${run}_run || exit; \
+	$(BIN)/deepclouds generate configs/labels.toml -o work/labels
+	if [ -e work/accurate_run/checkpoint.pt ]; then how=--resume; else how=configs/accurate.toml; fi; \
+	  $(BIN)/deepclouds train $$how -o work/accurate_run
+	$(BIN)/deepclouds export work/accurate_run -o work/accurate.onnx
+
+# The training labels and the held-out ones that a model is judged by; a tenth of the latter once more by Mitsuba's volpath.
+labels: setup-train
+	$(BIN)/deepclouds generate configs/labels.toml -o work/labels
+	for set in converged halves; do \
+	  $(BIN)/deepclouds generate configs/valid_$${set}_labels.toml -o work/valid_$$set || exit; \
+	  $(BIN)/deepclouds generate configs/valid_$${set}_labels.toml --tracer mitsuba -o work/valid_$${set}_volpath || exit; \
 	done
-	$(BIN)/deepclouds export work/first_finish_run -o work/first.onnx
+
+bench-labels: setup-bench
+	$(BIN)/python -m benchmarks.labels
 
 setup: $(STAMPS)/installed
 setup-test: $(STAMPS)/extra-test

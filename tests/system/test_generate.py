@@ -266,8 +266,6 @@ def test_merged_sets_hold_the_shards_of_both(made: Path, capsys: pytest.CaptureF
 
 def test_the_shipped_configurations_are_valid() -> None:
     for path in sorted(Path(__file__).parents[2].glob("configs/*.toml")):
-        if path.stem in ("first_labels", "first_coarse_labels"):
-            continue  # Written for the first model's data set, of schema 1; kept with that model as its record.
         if path.stem.endswith("labels"):
             load_config(path)
         else:
