@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -18,6 +20,10 @@ _UNIFORM_SHARE = 0.02
 _MAX_WIDTH = 2048
 # Rows and columns for a sky that is a formula: it is smooth.
 _SKY = (64, 128)
+# A uniform environment is a grid too, for the directions that stand for it.
+_UNIFORM_ROWS = 16
+# How much the size of a part of the sky counts beside its light when it is split: with 0 one dark half could stay whole.
+_PART_SIZE = 0.5
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -32,9 +38,36 @@ class LightSource(Protocol):
         """Density per steradian with which `sample` draws these directions."""
         ...
 
+    def beams(self, count: int) -> list[Beam]:
+        """About `count` directions that stand for all of the light, each for about the same share of it."""
+        ...
+
+    def arriving_beam(self, points: Any, beam: Beam, numbers: Stratified) -> list[Any]:
+        """Irradiance, perpendicular to its direction, that a beam brings to `points`; one array a colour channel."""
+        ...
+
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance that arrives at `points` from `direction` where there is no cloud; one array a colour channel."""
         ...
+
+
+@dataclass(frozen=True)
+class Beam:
+    """Light from a part of the sphere, seen as coming from one direction.
+
+    Attributes
+    ----------
+    omega
+        unit vector TOWARD it.
+    solid_angle
+        of the part, steradians.
+    irradiance
+        perpendicular to `omega`, one value a colour channel.
+    """
+
+    omega: tuple[float, float, float]
+    solid_angle: float
+    irradiance: tuple[float, ...]
 
 
 class Shade:
@@ -71,9 +104,9 @@ class Environment:
         Dr.Jit types.
     radiance
         callable: unit vectors pointing AWAY from the scene -> list of one float array a colour channel.
-    power
-        (rows, columns) relative importance per solid angle, not negative, on a latitude-longitude grid: row 0 at the pole +Y of
-        the table's frame, column position u at the direction (sin(2 pi u), ., -cos(2 pi u)).
+    colours
+        (rows, columns, channels) mean radiance of the cells of a latitude-longitude grid: row 0 at the pole +Y of the table's frame, column
+        position u at the direction (sin(2 pi u), ., -cos(2 pi u)). Their luminance is the importance of the cells.
     frame
         3 x 3 rotation from the table's frame to the world.
     shade
@@ -86,7 +119,7 @@ class Environment:
         self,
         types: ModuleType,
         radiance: Callable[[Any], list[Any]],
-        power: NDArray[np.floating[Any]],
+        colours: NDArray[np.floating[Any]],
         frame: NDArray[np.floating[Any]] | None = None,
         shade: Shade | None = None,
         uniform: float = _UNIFORM_SHARE,
@@ -95,6 +128,8 @@ class Environment:
         self._shade = shade or Shade(types, None)
         self.radiance = radiance
         self._frame = np.eye(3) if frame is None else np.asarray(frame, np.float64)
+        self._colours = np.maximum(np.asarray(colours, np.float64), 0)
+        power = luminance(self._colours)
         rows, columns = power.shape
         edges = np.cos(np.linspace(0, np.pi, rows + 1))
         weight = np.asarray(power, np.float64) * (edges[:-1] - edges[1:])[:, None]
@@ -140,6 +175,36 @@ class Environment:
         )
         upper, lower = dr.gather(t.Float, self._edges, row), dr.gather(t.Float, self._edges, row + 1)
         return probability * self._shape[1] / (2 * dr.pi * (upper - lower))
+
+    def beams(self, count: int) -> list[Beam]:
+        """Split the grid into `count` parts of equal luminance, each seen as coming from its middle (Debevec 2005, median cut).
+
+        Parts that are darker than the rest by far are left out, and a part of one cell is not split.
+        """
+        rows, columns = self._shape
+        edges = np.cos(np.linspace(0, np.pi, rows + 1))
+        solid = np.broadcast_to((edges[:-1] - edges[1:])[:, None] * (2 * np.pi / columns), (rows, columns))
+        energy = self._colours * solid[..., None]
+        weight = luminance(energy)
+        parts = median_cut(weight, solid, count)
+        directions = directions_of_cells(rows, columns, (0.5, 0.5)) @ self._frame.T
+        beams = []
+        for top, bottom, left, right in parts:
+            part = slice(top, bottom), slice(left, right)
+            if weight[part].sum() <= 0:
+                continue
+            middle = np.tensordot(weight[part], directions[part], axes=2)
+            length = float(np.linalg.norm(middle))
+            if length == 0:
+                continue
+            x, y, z = (float(v) for v in middle / length)
+            beams.append(Beam((x, y, z), float(solid[part].sum()), tuple(float(v) for v in energy[part].sum(axis=(0, 1)))))
+        return beams
+
+    def arriving_beam(self, points: Any, beam: Beam, numbers: Stratified) -> list[Any]:
+        """Irradiance of a beam past the surfaces; see `LightSource`."""
+        seen = self._shade.visible(points, self.types.Array3f(*(dr.opaque(self.types.Float, v) for v in beam.omega)))
+        return [dr.select(seen, dr.opaque(self.types.Float, v), 0) for v in beam.irradiance]
 
     def lookup(self, table: Any, direction: Any) -> Any:
         """Values of `table`, one float a cell of the grid, row by row, in the cells that these directions fall into."""
@@ -199,12 +264,12 @@ def environment(types: ModuleType, emitter: Any, shade: Shade) -> Environment:
     frame = frame / np.linalg.norm(frame, axis=0)
     parameters = mi.traverse(emitter)
     if "data" not in parameters and "turbidity" not in parameters:
-        return Environment(types, radiance, np.ones((1, 1)), frame, shade)
+        return Environment(types, radiance, _table(types, radiance, frame, _UNIFORM_ROWS, 2 * _UNIFORM_ROWS, 1), frame, shade)
     map_rows, map_columns = np.array(parameters["data"]).shape[:2] if "data" in parameters else _SKY
     columns = int(min(_MAX_WIDTH, max(64, map_columns)))
     rows = max(columns // 2, 32)
-    power = _table(types, radiance, frame, rows, columns, max(2, -(-2 * map_rows // rows)))
-    return Environment(types, radiance, power, frame, shade)
+    colours = _table(types, radiance, frame, rows, columns, max(2, -(-2 * map_rows // rows)))
+    return Environment(types, radiance, colours, frame, shade)
 
 
 def directions_of_cells(rows: int, columns: int, part: tuple[float, float]) -> NDArray[np.float64]:
@@ -214,25 +279,81 @@ def directions_of_cells(rows: int, columns: int, part: tuple[float, float]) -> N
     return np.stack(np.broadcast_arrays(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)), axis=-1)
 
 
-def luminance(values: list[Any], count: int) -> NDArray[np.float64]:
-    """Luminance (count,) of a colour given as one device array a channel; negative values count as 0."""
-    weights = _LUMINANCE if len(values) == 3 else (1.0,)
-    total = np.zeros(count)
+def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Luminance of colours (..., channels)."""
+    weights = _LUMINANCE if colours.shape[-1] == 3 else (1.0,)
+    return np.asarray(colours, np.float64) @ np.array(weights)
+
+
+def on_host(values: list[Any], count: int) -> NDArray[np.float64]:
+    """Colours (count, channels) given as one device array a channel; negative values count as 0."""
     # Together, or each channel would trace its own rays again.
     dr.eval(values)
-    for weight, value in zip(weights, values, strict=True):
-        total += weight * np.maximum(np.broadcast_to(np.array(value), count), 0)
-    return total
+    return np.stack([np.maximum(np.broadcast_to(np.array(value), count), 0) for value in values], axis=-1).astype(np.float64)
+
+
+def median_cut(weight: NDArray[np.float64], solid: NDArray[np.float64], count: int) -> list[tuple[int, int, int, int]]:
+    """Split a latitude-longitude grid into rectangles (top, bottom, left, right) of about equal weight and none too large.
+
+    Parameters
+    ----------
+    weight
+        (rows, columns) of the cells, not negative.
+    solid
+        (rows, columns) their solid angles.
+    count
+        rectangles wanted.
+    """
+    rows, columns = weight.shape
+    total, sphere = float(weight.sum()), float(solid.sum())
+    if total <= 0:
+        return []
+    # A dim part is split when it is large, so that what comes from its middle stands for all of it.
+    size = weight / total + _PART_SIZE * solid / sphere
+    sums = np.zeros((rows + 1, columns + 1))
+    sums[1:, 1:] = size.cumsum(axis=0).cumsum(axis=1)
+
+    def measure(part: tuple[int, int, int, int]) -> float:
+        top, bottom, left, right = part
+        return float(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left])
+
+    heap = [(-measure(whole), whole) for whole in [(0, rows, 0, columns)]]
+    done: list[tuple[int, int, int, int]] = []
+    while heap and len(heap) + len(done) < count:
+        _, (top, bottom, left, right) = heapq.heappop(heap)
+        high = bottom - top
+        middle = np.sin(np.pi * (top + bottom) / (2 * rows))
+        wide = (right - left) * (2 * rows / columns) * middle
+        part = size[top:bottom, left:right]
+        if high == 1 and right - left == 1:
+            done.append((top, bottom, left, right))
+            continue
+        if right - left == 1 or (high > 1 and high >= wide):
+            cut = top + _halves(part.sum(axis=1))
+            halves = [(top, cut, left, right), (cut, bottom, left, right)]
+        else:
+            cut = left + _halves(part.sum(axis=0))
+            halves = [(top, bottom, left, cut), (top, bottom, cut, right)]
+        for half in halves:
+            heapq.heappush(heap, (-measure(half), half))
+    return done + [part for _, part in heap]
+
+
+def _halves(line: NDArray[np.float64]) -> int:
+    """Where to cut a line of weights so that both parts are about equal, neither empty."""
+    sums = np.cumsum(line)
+    return int(np.clip(np.searchsorted(sums, 0.5 * sums[-1]) + 1, 1, len(line) - 1))
 
 
 def _table(
     types: ModuleType, radiance: Callable[[Any], list[Any]], frame: NDArray[np.float64], rows: int, columns: int, parts: int
 ) -> NDArray[np.float64]:
-    """Mean luminance of every cell, from `parts` x `parts` directions in each."""
-    total = np.zeros((rows, columns))
+    """Mean radiance (rows, columns, channels) of every cell, from `parts` x `parts` directions in each."""
+    total: Any = 0
     for part in np.ndindex(parts, parts):
         local = directions_of_cells(rows, columns, ((part[0] + 0.5) / parts, (part[1] + 0.5) / parts))
         world = (local.reshape(-1, 3) @ frame.T).astype(np.float32)
         values = radiance(types.Array3f(*(types.Float(np.ascontiguousarray(world[:, c])) for c in range(3))))
-        total += luminance(values, len(world)).reshape(rows, columns)
-    return total / parts**2
+        total = total + on_host(values, len(world)).reshape(rows, columns, -1)
+    result: NDArray[np.float64] = total / parts**2
+    return result

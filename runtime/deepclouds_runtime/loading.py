@@ -17,7 +17,7 @@ from deepclouds_runtime.scene import CloudScene, read_scene
 from deepclouds_runtime.volume_scene import options_from, volume_scene
 
 # How a render is done, whatever the input.
-RENDER_OPTIONS = ("multiple", "environment_directions", "interreflection")
+RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection")
 _MOST_THREADS = 1024
 SCENE_OPTIONS = ("sensor", "max_depth", "hide_emitters")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,9 @@ from deepclouds.medium.field import Field
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
 from deepclouds_runtime.camera import Camera
-from deepclouds_runtime.lights import Shade, environment, mitsuba_radiance
+from deepclouds_runtime.fast import fast_cloud_light
+from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
+from deepclouds_runtime.lights import Environment, Shade, environment, mitsuba_radiance
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, WalkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
@@ -29,7 +32,26 @@ Image = NDArray[np.float32]
 _PASS = 1 << 19
 # A pixel's samples are in flight together.
 _MOST_SAMPLES = 1 << 20
+# What the fast mode stops at by itself: a scene whose noise is still too large then says so.
+_MOST_AUTOMATIC = 1024
+# Noise of a pixel that the fast mode aims at, over the mean.
+ERROR = 0.02
+# Values below this share of the brightest do not count in the noise.
+_DARK = 0.02
+# Error of the interpolation at a point over the noise of a pixel, both aimed at: along rays and between pixels that of points averages out.
+_INTERPOLATION = 2.5
+# Rays that look for what the camera sees, and collisions on each of them.
+_PILOT, _PILOT_DEPTHS = 1 << 16, 4
+# Most queries for the suns, and as many for the light from all around.
+_BUDGET = 60_000
+# Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
+_BEAMS, _BRIGHT = 48, 0.1
+# Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
+_ROOT, _ROOT_AROUND = 2.0, 4.0
+# Collisions of a camera ray that get shadow rays.
+_DEPTHS = 4
 COLOURS = ("R", "G", "B")
+MODES = ("fast", "reference")
 LAYERS = ("volume_direct", "volume_indirect", "surface", "background")
 
 
@@ -80,6 +102,9 @@ class Renderer:
     interreflection
         whether surfaces receive the cloud's light, and the cloud that of the surfaces. Light that goes back and forth more than once,
         and light from one surface to another, are left out.
+    mode
+        ``"fast"``: J is predicted at a sparse set of points and interpolated, samples are spent until the noise is as asked; or
+        ``"reference"``: the method as published, where every sample asks the network.
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
@@ -97,15 +122,18 @@ class Renderer:
         multiple: str = "network",
         environment_directions: int = 2,
         interreflection: bool = True,
+        mode: str = "fast",
         load_seconds: float = 0.0,
     ) -> None:
+        if mode not in MODES:
+            raise InputError(f"mode = '{mode}': there are {' and '.join(repr(m) for m in MODES)}")
         if multiple not in ("network", "walks"):
             raise InputError(f"multiple = '{multiple}': J comes from 'network' or 'walks'")
         if environment_directions < 1:
             raise InputError(f"environment directions = {environment_directions}: at least one is drawn at each sample")
         started = time.perf_counter()
         self.scene = scene
-        self._multiple = multiple
+        self._multiple, self.mode = multiple, mode
         self.environment_directions = environment_directions
         self._types = types_of(mitsuba())
         self._field = Field(self._types, scene.volume, scene.scale)
@@ -120,7 +148,7 @@ class Renderer:
         self._load_seconds = load_seconds + time.perf_counter() - started
 
     def samples(self, spp: int | None) -> int:
-        """Samples a pixel of a render that is asked for `spp`: those of the camera's sampler for None."""
+        """Samples a pixel of a render that is asked for `spp`; for None those of the camera's sampler."""
         count = int(self.scene.sensor.sampler().sample_count()) if spp is None else int(spp)
         if count < 1:
             raise InputError(f"spp = {count}: a pixel needs at least one sample")
@@ -128,45 +156,57 @@ class Renderer:
             raise InputError(f"spp = {count}: at most {_MOST_SAMPLES:,}; average several renders with different seeds")
         return count
 
-    def render(self, spp: int | None = None, seed: int = 0, progress: Callable[[float], None] | None = None) -> RenderResult:
+    def render(
+        self, spp: int | None = None, seed: int = 0, progress: Callable[[float], None] | None = None, error: float = ERROR
+    ) -> RenderResult:
         """Render an image.
 
         Parameters
         ----------
         spp
-            samples a pixel; by default those of the camera's sampler.
+            samples a pixel. By default the fast mode takes as many as `error` asks for, the reference mode those of the camera's sampler.
         seed
             of all random numbers.
         progress
             is called with the share of the work done, 0 to 1.
+        error
+            of the fast mode: noise of a pixel to aim at, root of the mean square over the mean; the interpolation may add half as much.
 
         Raises
         ------
         InputError
-            when `spp` is below 1 or above 1,048,576.
+            when `spp` is below 1 or above 1,048,576, or `error` is not positive.
         """
         scene, types = self.scene, self._types
-        samples = self.samples(spp)
+        if not error > 0:
+            raise InputError(f"error = {error}: give the noise to aim at as a share of the mean, for example {ERROR}")
+        fast = self.mode == "fast" and (self._network is not None or scene.max_depth == 2)
+        most = self.samples(spp) if spp is not None or not fast else _MOST_AUTOMATIC
         started = time.perf_counter()
         scattering = None
         if scene.max_depth != 2:
             scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering), self._lights()
-        work = _Work(scene, Camera(types, scene.sensor), cloud, lights, lights, types, samples, seed, self._interreflection)
+        work = _Work(scene, Camera(types, scene.sensor), cloud, lights, lights, types, seed, self._interreflection)
         work.spent("lights", started)
         if self._interreflection:
             clock = time.perf_counter()
             reflectors = Reflectors(cloud, lights, seed & 0xFFFFFFFF, work.counts)
             work.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
             work.spent("probe", clock)
-        width, height = scene.size
-        total = width * height
-        pixels = max(1, _PASS // samples)
-        for first in range(0, total, pixels):
-            work.add(first, min(pixels, total - first))
-            if progress is not None:
-                progress(min(first + pixels, total) / total)
-        channels = work.image(height, width)
+        if fast:
+            work.prepare(_INTERPOLATION * error)
+        noise = math.inf
+        if spp is not None or not fast:
+            work.round(0, most, most, progress)
+        else:
+            while work.samples < most and not noise <= error:
+                before, done = work.beauty(), work.samples
+                size = 1 if done < 2 else math.ceil(done * (min(noise / error, 4.0) ** 1.5 - 1))
+                work.round(done, min(size, most - done), most, progress)
+                if done:
+                    noise = _noise(before, work.beauty()) * math.sqrt(done / (work.samples - done))
+        channels = work.image()
         seconds = {"load": self._load_seconds, **work.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
         return RenderResult(rgb, channels["A"], channels, seconds, work.counts, scene.notes)
@@ -190,39 +230,93 @@ class _Work:
     on_surfaces: Lights
     on_cloud: Lights
     types: Any
-    samples: int
     seed: int
     interreflection: bool
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
-    rows: dict[str, list[Image]] = field(default_factory=dict)
+    sums: dict[str, Image] = field(default_factory=dict)
+    samples: int = 0
+    sources: list[FrameSource] | None = None
 
-    def add(self, first: int, pixels: int) -> None:
-        """Render `pixels` pixels from number `first` on, all of their samples."""
+    def prepare(self, tolerance: float) -> None:
+        """Predict multiple scattering for this camera; from then on camera rays ask no network."""
+        clock = time.perf_counter()
+        width, height = self.scene.size
+        stride = math.ceil(math.sqrt(width * height / _PILOT))
+        columns, rows = np.arange(0, width, stride), np.arange(0, height, stride)
+        pixel = self.types.UInt32((rows[:, None] * width + columns).ravel().astype(np.uint32))
+        numbers = Stratified(
+            self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), dr.opaque(self.types.UInt32, 1), self._seed()
+        ).unrelated()
+        origin, direction, end = self.camera.rays(pixel, numbers)
+        if self.scene.surfaces is not None:
+            _, end, _ = self._surfaces(origin, direction, end)
+        seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
+        self.spent("pilot", clock)
+        clock = time.perf_counter()
+        suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
+        around: list[Arriving] = []
+        for source, _ in self.on_cloud.sources:
+            around += from_source(self.types, source, _BEAMS, isinstance(source, Environment), self.seed)
+        # What is a large part of all light gets the fine nodes of a sun.
+        power = sum(max(light.irradiance) for light in around)
+        suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
+        around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
+        found = [
+            frame_source(self.cloud, suns, self.camera, seen, _ROOT, tolerance, _BUDGET),
+            frame_source(self.cloud, around, self.camera, seen, _ROOT_AROUND, tolerance, _BUDGET),
+        ]
+        self.sources = [source for source in found if source is not None]
+        self.counts.queries += sum(source.queries for source in self.sources)
+        self.spent("prediction", clock)
+
+    def round(self, first: int, samples: int, most: int, progress: Callable[[float], None] | None) -> None:
+        """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all."""
+        width, height = self.scene.size
+        total = width * height
+        pixels = max(1, _PASS // samples)
+        for start in range(0, total, pixels):
+            count = min(pixels, total - start)
+            self.add(start, count, first, samples, most)
+            if progress is not None:
+                progress((first + samples * (start + count) / total) / most)
+        self.samples += samples
+
+    def _seed(self) -> Any:
+        return dr.opaque(self.types.UInt32, self.seed & 0xFFFFFFFF)
+
+    def add(self, first: int, pixels: int, sample: int, samples: int, most: int) -> None:
+        """Render `pixels` pixels from number `first` on, `samples` samples each from number `sample` of `most` on."""
         types, scene = self.types, self.scene
-        n = pixels * self.samples
+        n = pixels * samples
         self.counts.camera_samples += n
-        count = dr.opaque(types.UInt32, self.samples)
+        count = dr.opaque(types.UInt32, samples)
         index = dr.arange(types.UInt32, n)
         local = index // count
         pixel = local + dr.opaque(types.UInt32, first)
-        numbers = Stratified(types, pixel, index - local * count, count, dr.opaque(types.UInt32, self.seed & 0xFFFFFFFF))
+        numbers = Stratified(
+            types, pixel, index - local * count + dr.opaque(types.UInt32, sample), dr.opaque(types.UInt32, most), self._seed()
+        )
+        where = slice(first, first + pixels), samples
         origin, direction, end = self.camera.rays(pixel, numbers)
         interaction: Any = None
         shown: Any = None
         if scene.surfaces is not None:
             interaction, end, shown = self._surfaces(origin, direction, end)
         clock = time.perf_counter()
-        light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
+        if self.sources is None:
+            light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
+        else:
+            light = fast_cloud_light(self.cloud, self.on_cloud, self.sources, origin, direction, end, numbers, self.counts, _DEPTHS)
         dr.eval(light.direct, light.indirect)
         dr.sync_thread()
         self.spent("cloud", clock)
         clock = time.perf_counter()
-        self._collect("volume_direct", light.direct)
-        self._collect("volume_indirect", light.indirect)
-        self._collect("volume_opacity", [light.opacity])
+        self._collect(where, "volume_direct", light.direct)
+        self._collect(where, "volume_indirect", light.indirect)
+        self._collect(where, "volume_opacity", [light.opacity])
         depth = self.camera.distance(dr.fma(direction, light.distance, origin))
-        self._collect("volume_Z", [depth * light.opacity])
+        self._collect(where, "volume_Z", [depth * light.opacity])
         through = light.transmittance
         behind = through
         alpha = light.opacity
@@ -232,14 +326,14 @@ class _Work:
                 weight = dr.select(shown, through, 0)
                 thrown = reflected_from_cloud(self.cloud, self.on_cloud, interaction, weight, numbers, self.counts)
                 colours = [a + b for a, b in zip(colours, thrown, strict=True)]
-            self._collect("surface", [value * through for value in colours])
+            self._collect(where, "surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)
             alpha = alpha + dr.select(shown, through, 0)
         if scene.backdrop is not None and not scene.hide_emitters:
             sky = mitsuba_radiance(types, scene.backdrop)(direction)
-            self._collect("background", [value * behind for value in sky])
+            self._collect(where, "background", [value * behind for value in sky])
             alpha = alpha + behind
-        self._collect("A", [alpha])
+        self._collect(where, "A", [alpha])
         self.spent("surfaces and background", clock)
 
     def _surfaces(self, origin: Any, direction: Any, end: Any) -> tuple[Any, Any, Any]:
@@ -251,35 +345,51 @@ class _Work:
         shown = plain(types, interaction.is_valid())
         return interaction, dr.select(shown, plain(types, interaction.t), end), shown
 
-    def _collect(self, name: str, values: list[Any]) -> None:
-        """Average the samples of each pixel and keep the result under `name`."""
-        n = self.samples
+    def _collect(self, where: tuple[slice, int], name: str, values: list[Any]) -> None:
+        """Add the samples of each pixel to what is kept under `name`."""
+        pixels, n = where
         # Together, or each channel would trace its own rays again.
         dr.eval(values)
-        rows = [np.array(dr.block_sum(value, n)) * np.float32(1 / n) for value in values]
-        self.rows.setdefault(name, []).append(np.stack(rows, axis=-1))
+        width, height = self.scene.size
+        kept = self.sums.setdefault(name, np.zeros((width * height, len(values)), np.float32))
+        for c, value in enumerate(values):
+            kept[pixels, c] += np.array(dr.block_sum(value, n))
 
     def spent(self, stage: str, since: float) -> None:
         """Add the seconds since `since` to a stage."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - since
 
-    def image(self, height: int, width: int) -> dict[str, Image]:
-        """All channels (h, w) of the finished image."""
-        channels: dict[str, Image] = {}
-        beauty = np.zeros((height, width, 3), np.float32)
+    def beauty(self) -> Image:
+        """The image so far (pixels, 3)."""
+        width, height = self.scene.size
+        total = np.zeros((width * height, 3), np.float32)
         for layer in LAYERS:
-            if layer in self.rows:
-                values = np.concatenate(self.rows[layer]).reshape(height, width, -1)
-                values = np.broadcast_to(values, (height, width, 3))
-            else:
-                values = np.zeros((height, width, 3), np.float32)
-            beauty = beauty + values
+            if layer in self.sums:
+                total += self.sums[layer] * np.float32(1 / self.samples)
+        return total
+
+    def image(self) -> dict[str, Image]:
+        """All channels (h, w) of the finished image."""
+        width, height = self.scene.size
+        means = {name: values * np.float32(1 / self.samples) for name, values in self.sums.items()}
+        channels: dict[str, Image] = {}
+        for layer in LAYERS:
+            values = np.broadcast_to(means.get(layer, np.zeros((width * height, 3), np.float32)), (width * height, 3))
             for c, colour in enumerate(COLOURS):
-                channels[f"{layer}.{colour}"] = np.ascontiguousarray(values[..., c])
-        single = {name: np.concatenate(self.rows[name]).reshape(height, width) for name in ("volume_opacity", "volume_Z", "A")}
-        opacity = single["volume_opacity"]
-        channels |= {colour: np.ascontiguousarray(beauty[..., c]) for c, colour in enumerate(COLOURS)}
-        channels["A"] = np.minimum(single["A"], 1)
+                channels[f"{layer}.{colour}"] = np.ascontiguousarray(values[:, c]).reshape(height, width)
+        beauty = self.beauty()
+        opacity, depth, alpha = (means[name].reshape(height, width) for name in ("volume_opacity", "volume_Z", "A"))
+        channels |= {colour: np.ascontiguousarray(beauty[:, c]).reshape(height, width) for c, colour in enumerate(COLOURS)}
+        channels["A"] = np.minimum(alpha, 1)
         channels["volume_opacity"] = opacity
-        channels["volume_Z"] = np.where(opacity > 0, single["volume_Z"] / np.where(opacity > 0, opacity, 1), 0).astype(np.float32)
+        channels["volume_Z"] = np.where(opacity > 0, depth / np.where(opacity > 0, opacity, 1), 0).astype(np.float32)
         return channels
+
+
+def _noise(a: Image, b: Image) -> float:
+    """Root of the mean squared difference of two images (pixels, channels) over their mean, where they are not dark."""
+    mean = 0.5 * (a + b).astype(np.float64)
+    lit = mean > _DARK * np.quantile(mean, 0.999)
+    if not lit.any():
+        return 0.0
+    return float(np.sqrt(np.mean(np.square(a - b)[lit], dtype=np.float64)) / mean[lit].mean())

@@ -11,11 +11,26 @@ import numpy as np
 # the first two are the powers of the plastic number instead, the best spread for pairs.
 _STEPS = tuple(
     round(float(value % 1.0) * 2**32)
-    for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37]))
+    for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43]))
 )
-PIXEL_X, PIXEL_Y, MARCH, LIGHT_U, LIGHT_V, PHASE_U, PHASE_V, SURFACE_U, SURFACE_V, SURFACE_W, SHADOW, ROULETTE, LENS_U, LENS_V = range(
-    len(_STEPS)
-)
+(
+    PIXEL_X,
+    PIXEL_Y,
+    MARCH,
+    LIGHT_U,
+    LIGHT_V,
+    PHASE_U,
+    PHASE_V,
+    SURFACE_U,
+    SURFACE_V,
+    SURFACE_W,
+    SHADOW,
+    ROULETTE,
+    PLACE,
+    SHARE,
+    LENS_U,
+    LENS_V,
+) = range(len(_STEPS))
 DEPTH = len(_STEPS)
 _DIMENSIONS = DEPTH + 1
 
@@ -60,6 +75,19 @@ class Stratified:
         other = Stratified(self._types, self._pixel, self._sample, self._count, self._seed ^ self._types.UInt32(0xC2B2AE35))
         other._spread = False
         return other
+
+    def several(self, count: int) -> Stratified:
+        """Numbers for `count` lanes in place of each, which continue the same sequences."""
+        import drjit as dr
+
+        u32 = self._types.UInt32
+        many = dr.opaque(u32, count)
+        lane = dr.arange(u32, dr.width(self._pixel, self._sample) * count)
+        of = lane // many
+        pixel, sample = (dr.gather(u32, values, of) if dr.width(values) > 1 else values for values in (self._pixel, self._sample))
+        numbers = Stratified(self._types, pixel, sample * many + (lane - of * many), self._count * many, self._seed)
+        numbers._spread = self._spread
+        return numbers
 
     def take(self, lanes: Any) -> Stratified:
         """The same numbers for the lanes with these indices only."""

@@ -14,7 +14,7 @@ from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.medium.phase import rotate_to
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
-from deepclouds_runtime.lights import Environment, directions_of_cells, luminance
+from deepclouds_runtime.lights import Beam, Environment, directions_of_cells, on_host
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
@@ -163,10 +163,10 @@ class Reflectors:
 
     def __init__(self, cloud: Cloud, lights: Lights, seed: int, counts: Counts) -> None:
         self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
-        power, colours = self._probe(seed, counts)
-        self._table = Environment(self._types, self._nothing, power, uniform=_PROBE_UNIFORM)
-        self._thrown = [self._types.Float(np.ascontiguousarray(colours[:, c], np.float32)) for c in range(colours.shape[1])]
-        self.sample, self.density = self._table.sample, self._table.density
+        colours, thrown = self._probe(seed, counts)
+        self._table = Environment(self._types, self._nothing, colours, uniform=_PROBE_UNIFORM)
+        self._thrown = [self._types.Float(np.ascontiguousarray(thrown[:, c], np.float32)) for c in range(thrown.shape[1])]
+        self.sample, self.density, self.beams = self._table.sample, self._table.density, self._table.beams
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance of the surface seen from `points`, 0 where there is none; see `LightSource`."""
@@ -174,6 +174,13 @@ class Reflectors:
         shown = plain(self._types, interaction.is_valid())
         direct = reflected(self._cloud, self._lights, interaction, numbers.unrelated())
         return [d + dr.select(shown, self._table.lookup(t, direction), 0) for d, t in zip(direct, self._thrown, strict=True)]
+
+    def arriving_beam(self, points: Any, beam: Beam, numbers: Stratified) -> list[Any]:
+        """Irradiance of a beam: the surface that `points` see in its direction stands for all of its part; see `LightSource`."""
+        omega = self._types.Array3f(*(dr.opaque(self._types.Float, v) for v in beam.omega))
+        direction = dr.zeros(self._types.Array3f, dr.width(points)) + omega
+        solid_angle = dr.opaque(self._types.Float, beam.solid_angle)
+        return [value * solid_angle for value in self.arriving(points, direction, numbers)]
 
     def _seen(self, points: Any, direction: Any) -> Any:
         mi = mitsuba()
@@ -183,14 +190,14 @@ class Reflectors:
         return [dr.zeros(self._types.Float, dr.width(direction)) for _ in self._cloud.albedo]
 
     def _probe(self, seed: int, counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Luminance (rows, columns) of the surfaces around the middle of the cloud's box; the cloud's light they send (cells, channels)."""
+        """Colour (rows, columns, channels) of the surfaces around the box's middle; the cloud's light they send (cells, channels)."""
         types: ModuleType = self._types
         rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
         lower, upper = self._cloud.field.volume.bounds
         middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
         random = np.random.default_rng(seed)
         n = rows * columns
-        power, thrown = np.zeros(n), np.zeros((n, len(self._cloud.albedo)))
+        colours, thrown = np.zeros((n, len(self._cloud.albedo))), np.zeros((n, len(self._cloud.albedo)))
         for part in range(_PROBE_PARTS):
             place = random.random(2)
             local = directions_of_cells(rows, columns, (float(place[0]), float(place[1]))).reshape(-1, 3).astype(np.float32)
@@ -206,6 +213,6 @@ class Reflectors:
             dr.eval(interaction)
             direct = reflected(self._cloud, self._lights, interaction, numbers)
             sent = reflected_from_cloud(self._cloud, self._lights, interaction, dr.full(types.Float, 1, n), numbers, counts)
-            power += luminance([a + b for a, b in zip(direct, sent, strict=True)], n)
-            thrown += np.stack([np.array(value) for value in sent], axis=-1)
-        return power.reshape(rows, columns) / _PROBE_PARTS, thrown / _PROBE_PARTS
+            colours += on_host([a + b for a, b in zip(direct, sent, strict=True)], n)
+            thrown += on_host(sent, n)
+        return colours.reshape(rows, columns, -1) / _PROBE_PARTS, thrown / _PROBE_PARTS

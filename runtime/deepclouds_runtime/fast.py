@@ -1,0 +1,98 @@
+"""Light of the cloud along camera rays with multiple scattering already known: no network, two short marches and a few shadow rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+
+from deepclouds_runtime import stratified
+from deepclouds_runtime.frame_source import FrameSource
+from deepclouds_runtime.march import depths, gathered
+from deepclouds_runtime.stratified import Stratified
+from deepclouds_runtime.transport import Cloud, CloudLight, Counts, Lights, opacity_of, single_scattering
+
+
+def fast_cloud_light(
+    cloud: Cloud,
+    lights: Lights,
+    sources: Sequence[FrameSource],
+    origin: Any,
+    direction: Any,
+    end: Any,
+    numbers: Stratified,
+    counts: Counts,
+    count: int,
+) -> CloudLight:
+    """Light that the cloud sends back along camera rays, and what it hides.
+
+    Multiple scattering is summed along the whole ray; single scattering is taken at `count` collisions, one in each equal share of what the
+    ray's cloud hides.
+
+    Parameters
+    ----------
+    cloud, lights
+        the medium and what lights it.
+    sources
+        multiple scattering of this camera.
+    origin, direction, end
+        the rays, world units.
+    numbers
+        random numbers of the lanes.
+    counts
+        is updated.
+    count
+        collisions a ray.
+    """
+    types, medium = cloud.field.types, cloud.field
+    n, channels = dr.width(origin, direction, end), len(cloud.albedo)
+    enter, leave = medium.intersect(origin, direction)
+    meets = dr.minimum(leave, end) > enter
+    dr.eval(origin, direction, end, meets)
+    result = CloudLight(dr.zeros(types.Float, n), dr.full(types.Float, 1, n), dr.zeros(types.Float, n))
+    result.direct = [dr.zeros(types.Float, n) for _ in range(channels)]
+    result.indirect = [dr.zeros(types.Float, n) for _ in range(channels)]
+    lanes: Any = dr.compress(meets)
+    if len(lanes) == 0:
+        return result
+    o, d = _take(types, origin, lanes), _take(types, direction, lanes)
+    e = dr.gather(types.Float, end, lanes) if dr.width(end) > 1 else end
+    own = numbers.take(lanes)
+    jitter = own.number(stratified.MARCH)
+    octrees = [source.octree for source in sources]
+    tau, sums = gathered(medium, octrees, o, d, e, jitter, own.number(stratified.PLACE), types.Bool(True))
+    hidden = opacity_of(tau)
+    indirect = [dr.zeros(types.Float, len(lanes)) for _ in range(channels)]
+    for source, values in zip(sources, sums, strict=True):
+        indirect = [a + b for a, b in zip(indirect, source.colours(values), strict=True)]
+    dr.eval(hidden, tau, indirect, o, d, e, jitter)
+    dr.scatter(result.opacity, hidden, lanes)
+    dr.scatter(result.transmittance, dr.exp(-tau), lanes)
+    for c in range(channels):
+        dr.scatter(result.indirect[c], indirect[c], lanes)
+    filled: Any = dr.compress(hidden > 0)
+    counts.cloud_samples += len(filled)
+    if len(filled) == 0:
+        return result
+    lanes = dr.gather(types.UInt32, lanes, filled)
+    o, d = _take(types, o, filled), _take(types, d, filled)
+    e, jitter, hidden = (dr.gather(types.Float, v, filled) if dr.width(v) > 1 else v for v in (e, jitter, hidden))
+    own = own.take(filled)
+    distance = depths(medium, o, d, e, jitter, hidden, own.number(stratified.SHARE), count, types.Bool(True))
+    dr.eval(distance)
+    dr.scatter(result.distance, dr.block_sum(distance, count) * (1 / count), lanes)
+    if any(a > 0 for a in cloud.albedo):
+        lane = dr.arange(types.UInt32, len(filled) * count) // dr.opaque(types.UInt32, count)
+        w = _take(types, d, lane)
+        points = dr.fma(w, distance, _take(types, o, lane))
+        single = single_scattering(replace(cloud, scattering=None), lights, points, w, own.several(count))
+        dr.eval(single)
+        for c in range(channels):
+            dr.scatter(result.direct[c], dr.block_sum(single[c], count) * hidden * (1 / count), lanes)
+    return result
+
+
+def _take(types: Any, vector: Any, lanes: Any) -> Any:
+    return types.Array3f(*(dr.gather(types.Float, v, lanes) if dr.width(v) > 1 else v for v in vector))

@@ -1,0 +1,282 @@
+"""Multiple scattering of one frame: predicted at the nodes of an octree, interpolated everywhere else.
+
+From one camera every point is seen from one direction, so under lights at infinity J is a function of the place alone for that frame, and
+smooth on the scale of a mean free path.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.medium.field import Field
+from deepclouds.medium.optical_depth import optical_depth
+from deepclouds_runtime.camera import Camera
+from deepclouds_runtime.lights import Beam, LightSource, Shade
+from deepclouds_runtime.march import depths
+from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_around
+from deepclouds_runtime.scattering import NetworkScattering
+from deepclouds_runtime.scene_lights import Sun
+from deepclouds_runtime.stratified import Stratified
+from deepclouds_runtime.transport import Cloud, opacity_of
+
+Array = NDArray[Any]
+_LEVELS = 7
+# Points at which the interpolation is measured.
+_CHECKS, _LEAST_CHECKS = 512, 64
+# Queries that are prepared together.
+_AT_ONCE = 16384
+_DEEP = 1e6
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """J of a frame on the device.
+
+    Attributes
+    ----------
+    octree
+        fields of j times irradiance, summed over lights.
+    mix
+        (channels, fields): J of a colour channel is this mixture of the fields.
+    statistics
+        what it took.
+    error
+        of the interpolation at a point that the camera sees, measured: root of the mean square over the mean.
+    queries
+        asked of the network.
+    """
+
+    octree: DeviceOctree
+    mix: Array
+    statistics: Statistics
+    error: float
+    queries: int
+
+    def colours(self, values: list[Any]) -> list[Any]:
+        """Colour channels of sums over the fields."""
+        types = self.octree.types
+        result = []
+        for row in self.mix:
+            terms = [value * dr.opaque(types.Float, float(m)) for value, m in zip(values, row, strict=True) if m != 0]
+            result.append(sum(terms[1:], terms[0]) if terms else dr.zeros(types.Float, dr.width(values[0])))
+        return result
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Samples of what the camera sees of the cloud: world points (n, 3) and their shares of the image (n,)."""
+
+    points: Array
+    weights: Array
+
+
+def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, count: int) -> Seen:
+    """Collisions along rays, `count` a ray, one in each equal share of what the cloud hides."""
+    types = field.types
+    tau = optical_depth(field, origin, direction, types.Float(0), end, types.Float(0.5), types.Bool(True))
+    hidden = opacity_of(tau)
+    dr.eval(hidden, origin, direction, end)
+    lanes: Any = dr.compress(hidden > 0)
+    n = len(lanes)
+    if n == 0:
+        return Seen(np.empty((0, 3)), np.empty(0))
+    origin, direction = (_take(types, v, lanes) for v in (origin, direction))
+    end, hidden, shift = (dr.gather(types.Float, v, lanes) if dr.width(v) > 1 else v for v in (end, hidden, shift))
+    distance = depths(field, origin, direction, end, types.Float(0.5), hidden, shift, count, types.Bool(True))
+    lane = dr.arange(types.UInt32, n * count) // dr.opaque(types.UInt32, count)
+    points = dr.fma(_take(types, direction, lane), distance, _take(types, origin, lane))
+    return Seen(np.array(points).T.astype(np.float64), np.repeat(np.array(hidden, np.float64) / count, count))
+
+
+def _take(types: Any, vector: Any, lanes: Any) -> Any:
+    return types.Array3f(*(dr.gather(types.Float, v, lanes) if dr.width(v) > 1 else v for v in vector))
+
+
+@dataclass(frozen=True)
+class Arriving:
+    """One direction that light comes from.
+
+    Attributes
+    ----------
+    omega
+        unit vector TOWARD it.
+    irradiance
+        perpendicular to it where nothing is in the way, one value a colour channel.
+    at
+        callable: points (Array3f) -> the irradiance that arrives there but for the cloud, one Float a channel.
+    plain
+        whether `at` is `irradiance` times one number, the same for all channels.
+    """
+
+    omega: tuple[float, float, float]
+    irradiance: tuple[float, ...]
+    at: Callable[[Any], list[Any]]
+    plain: bool
+
+
+def from_suns(types: Any, suns: Sequence[Sun], shade: Shade) -> list[Arriving]:
+    """Distant suns past the surfaces."""
+
+    def of(sun: Sun) -> Arriving:
+        def at(points: Any) -> list[Any]:
+            seen = shade.visible(points, types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun)))
+            return [dr.select(seen, dr.opaque(types.Float, e), 0) for e in sun.irradiance]
+
+        return Arriving(sun.omega_sun, sun.irradiance, at, True)
+
+    return [of(sun) for sun in suns if max(sun.irradiance) > 0]
+
+
+def from_source(types: Any, source: LightSource, count: int, plain: bool, seed: int) -> list[Arriving]:
+    """A light from all around as `count` directions, chosen once for the frame."""
+
+    def of(beam: Beam) -> Arriving:
+        def at(points: Any) -> list[Any]:
+            n = dr.width(points)
+            lanes = dr.arange(types.UInt32, n)
+            one = dr.opaque(types.UInt32, 1)
+            numbers = Stratified(types, lanes, dr.zeros(types.UInt32, n), one, dr.opaque(types.UInt32, seed & 0xFFFFFFFF))
+            return source.arriving_beam(points, beam, numbers.unrelated())
+
+        return Arriving(beam.omega, beam.irradiance, at, plain)
+
+    return [of(beam) for beam in source.beams(count) if max(beam.irradiance) > 0]
+
+
+def frame_source(
+    cloud: Cloud, lights: Sequence[Arriving], camera: Camera, seen: Seen, root: float, tolerance: float, budget: int
+) -> FrameSource | None:
+    """J of a frame; None where it is 0 everywhere.
+
+    Parameters
+    ----------
+    cloud
+        the medium; its `scattering` is the network.
+    lights
+        where light comes from.
+    camera
+        tells in which direction each point is seen.
+    seen
+        what the camera sees.
+    root
+        edge of the coarsest cells in units of length (mean free paths).
+    tolerance, budget
+        see `Octree`; `budget` counts queries.
+    """
+    network = cloud.scattering
+    albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
+    if not albedos or not lights or not len(seen.points) or not isinstance(network, NetworkScattering) or network.descriptor.empty:
+        return None
+    field = cloud.field
+    predicted = _Predicted(cloud, network, lights, albedos, camera)
+    volume = field.volume
+    edges = volume.to_world[:3, :3]
+    lengths = np.linalg.norm(edges, axis=0)
+    lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, root * network.descriptor.unit)
+    nodes = max(1, budget // (len(lights) * len(albedos)))
+    # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
+    checks = min(max(_LEAST_CHECKS, _CHECKS // len(lights)), len(seen.points) // 2)
+    held_out, built_for = _split(seen, checks)
+    octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS)
+    device = octree.upload(field.types)
+    factor, error = _audit(device, predicted, held_out)
+    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries)
+
+
+class _Predicted:
+    """What the octree interpolates: the network's j summed over lights, one field for each different albedo or for each colour channel."""
+
+    def __init__(
+        self, cloud: Cloud, network: NetworkScattering, lights: Sequence[Arriving], albedos: tuple[float, ...], camera: Camera
+    ) -> None:
+        self._cloud, self._network, self._lights, self._albedos, self._camera = cloud, network, lights, albedos, camera
+        self.queries = 0
+        square = np.array(cloud.albedo) ** 2 / (4 * math.pi)
+        tint = _tint(lights)
+        self._brightest = -1
+        # Which of the albedos each field belongs to.
+        self._of_field = [albedos.index(a) if a > 0 else -1 for a in cloud.albedo]
+        if tint is None:
+            self.mix = np.diag(square)
+        else:
+            self._brightest = int(np.argmax(tint))
+            self.mix = np.zeros((len(cloud.albedo), len(albedos)))
+            for c, k in enumerate(self._of_field):
+                if k >= 0:
+                    self.mix[c, k] = square[c] * tint[c] / tint[self._brightest]
+            self._of_field = list(range(len(albedos)))
+
+    def __call__(self, points: Array) -> Array:
+        """Fields (n, k) at world points (n, 3)."""
+        n = len(points)
+        total = np.zeros((n, self.mix.shape[1]), np.float32)
+        at_once = max(1, _AT_ONCE // max(n, 1))
+        for first in range(0, len(self._lights), at_once):
+            self._add(points, self._lights[first : first + at_once], total)
+        return total
+
+    def _add(self, points: Array, lights: Sequence[Arriving], total: Array) -> None:
+        types, field, n = self._cloud.field.types, self._cloud.field, len(points)
+        w = self._camera.toward(points)
+        x, d = (_upload(types, np.tile(v, (len(lights), 1))) for v in (points, w))
+        omega = _upload(types, np.repeat([light.omega for light in lights], n, axis=0))
+        tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), _DEEP)
+        dr.eval(tau)
+        j = self._network(x, d, omega, self._cloud.phase, self._albedos, tau).reshape(len(lights), n, -1)
+        self.queries += j.size
+        x = _upload(types, points)
+        for light, values in zip(lights, j, strict=True):
+            arriving = light.at(x)
+            dr.eval(arriving)
+            for f, k in enumerate(self._of_field):
+                if k >= 0:
+                    total[:, f] += np.array(arriving[f if self._brightest < 0 else self._brightest]) * values[:, k]
+
+
+def _upload(types: Any, values: Array) -> Any:
+    return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c], np.float32)) for c in range(3)))
+
+
+def _tint(lights: Sequence[Arriving]) -> Array | None:
+    """Colour that all lights share, or None where their colours differ."""
+    if not all(light.plain for light in lights):
+        return None
+    irradiance = np.array([light.irradiance for light in lights], np.float64)
+    tint = irradiance[0] / irradiance[0].max()
+    return tint if np.allclose(irradiance, irradiance.max(axis=1, keepdims=True) * tint, rtol=1e-5) else None
+
+
+def _split(seen: Seen, count: int) -> tuple[Seen, Seen]:
+    """`count` of the points, one in each equal share of the image's light and all of one weight, and the points that are not among them."""
+    total = np.cumsum(seen.weights)
+    places = (np.arange(count) + 0.5) / max(count, 1) * total[-1]
+    chosen = np.minimum(np.searchsorted(total, places), len(total) - 1)
+    rest = np.ones(len(total), bool)
+    rest[chosen] = False
+    return Seen(seen.points[chosen], np.ones(count)), Seen(seen.points[rest], seen.weights[rest])
+
+
+def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: Seen) -> tuple[float, float]:
+    """Compare interpolated with true values at points that the camera sees.
+
+    A cloud is bright where it is dense, and nodes lie anywhere: interpolation is a little too dark. Returns the factor that makes up for it
+    on the mean, and the error that remains at a point, root of the mean square over the mean.
+    """
+    if not len(checks.points):
+        return 1.0, 0.0
+    true = evaluate(checks.points).astype(np.float64)
+    values = octree.lookup(octree.to_local(_upload(octree.types, checks.points)), octree.types.Bool(True))
+    dr.eval(values)
+    interpolated = np.stack([np.array(v, np.float64) for v in values], axis=1)
+    if not (true.sum() > 0 and interpolated.sum() > 0):
+        return 1.0, 0.0
+    factor = float(true.sum() / interpolated.sum())
+    error = float(np.sqrt(np.mean(np.square(factor * interpolated - true))) / true.mean())
+    return factor, error

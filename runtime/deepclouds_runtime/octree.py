@@ -1,0 +1,306 @@
+"""A scalar field known at a few points: an octree refined where linear interpolation would be seen to err.
+
+Roots are cubes of one size on a lattice along the axes of the volume. A cell holds the values at its corners and is interpolated
+trilinearly; a cell that is split asks for the corners of its eight children. Where a finer cell meets a coarser one the two
+interpolations differ by about the error that was allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+# Corners of the unit cube, x fastest.
+_CORNERS = np.array([(i & 1, (i >> 1) & 1, (i >> 2) & 1) for i in range(8)], np.int64)
+# A lattice coordinate keeps 21 bits, three of them make a key of 63.
+_BITS = 21
+_MOST_CELLS_A_SIDE = 64
+# Halving the spacing divides the error of linear interpolation of a smooth function by four; where a kink is nearer than the spacing,
+# by two. What a finer level corrected is divided by this to estimate what is still wrong.
+_GAIN = 3.0
+# Error that is taken for that of root cells, of which nothing is known, over the mean value.
+_UNMEASURED = 0.15
+# New corners of a cell that is split: neighbours share most of the 19 that all of its children have.
+_NODES_A_SPLIT = 7
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cubes of one size along three axes.
+
+    Attributes
+    ----------
+    origin
+        (3,) world point of the lattice's corner (0, 0, 0).
+    axes
+        (3, 3), columns are unit vectors.
+    spacing
+        edge of a root cell, world units.
+    size
+        (3,) number of root cells along each axis.
+    """
+
+    origin: Array
+    axes: Array
+    spacing: float
+    size: Array
+
+    def local(self, points: Array) -> Array:
+        """Coordinates of world points (n, 3) in root cells."""
+        return (points - self.origin) @ self.axes / self.spacing
+
+    def world(self, local: Array) -> Array:
+        """World points of coordinates (n, 3) in root cells."""
+        return local * self.spacing @ self.axes.T + self.origin
+
+
+@dataclass
+class Statistics:
+    """What building an octree took.
+
+    Attributes
+    ----------
+    nodes
+        points that were asked for.
+    cells
+        cells that were refined, level by level.
+    error
+        estimated error of the interpolation, root of the mean square over the image's samples, over their mean value.
+    """
+
+    nodes: int = 0
+    cells: list[int] = field(default_factory=list)
+    error: float = 0.0
+
+
+def lattice_around(lengths: Array, corner: Array, axes: Array, spacing: float) -> Lattice:
+    """Lattice that covers a box with edges `lengths` along `axes` from `corner`, of cells of about `spacing`.
+
+    There are at least two cells along the longest edge, and at most `_MOST_CELLS_A_SIDE`.
+    """
+    longest = float(lengths.max())
+    spacing = float(np.clip(spacing, longest / _MOST_CELLS_A_SIDE, longest / 2))
+    size = np.maximum(np.ceil(lengths / spacing - 1e-6), 1).astype(np.int64)
+    # The box stands in the middle of its cells.
+    return Lattice(corner - axes @ (0.5 * (size * spacing - lengths)), axes, spacing, size)
+
+
+class Octree:
+    """Values at the corners of adaptive cells; see the module.
+
+    Parameters
+    ----------
+    lattice
+        the root cells.
+    evaluate
+        true values (n, k), float32, at world points (n, 3).
+    points, weights
+        world points (n, 3) where the field will be asked for, and how much each counts.
+    tolerance
+        error of the interpolation to aim at, over the mean value (root of the mean square over the points).
+    budget
+        no more points are asked for once there are so many.
+    levels
+        most levels of refinement.
+
+    Attributes
+    ----------
+    statistics
+        what it took.
+    """
+
+    def __init__(
+        self,
+        lattice: Lattice,
+        evaluate: Callable[[Array], Array],
+        points: Array,
+        weights: Array,
+        tolerance: float,
+        budget: int,
+        levels: int,
+    ) -> None:
+        self.lattice = lattice
+        self.statistics = Statistics()
+        self._evaluate = evaluate
+        self._levels = min(levels, _BITS - 1 - int(lattice.size.max()).bit_length())
+        self._keys = np.empty(0, np.int64)
+        self._known: Array = np.empty((0, 0), np.float32)
+        nx, ny, nz = (int(n) for n in lattice.size)
+        local = np.clip(lattice.local(points), 0, lattice.size - 1e-6)
+        cell_of_point = local.astype(np.int64)
+        index = cell_of_point[:, 0] + nx * (cell_of_point[:, 1] + ny * cell_of_point[:, 2])
+        cells, member = np.unique(index, return_inverse=True)
+        coordinates = np.stack([cells % nx, cells // nx % ny, cells // (nx * ny)], axis=1)
+        values = self._corner_values(coordinates, 0)
+        self.fields = values.shape[2]
+        leaves = [self._roots(coordinates, values)]
+        leaves[0][cells] = values
+        # An entry of the table is the number of a leaf, or less than 0: where the eight entries of the children begin.
+        table, slots, count = np.arange(nx * ny * nz), cells, nx * ny * nz
+        scale = self._scale(local, member, weights, values, coordinates, 0)
+        known_error = np.full(len(cells), _UNMEASURED * scale)
+        settled = 0.0
+        total = float(weights.sum())
+        for level in range(self._levels + 1):
+            share = np.bincount(member, weights, minlength=len(coordinates))
+            squared = share * known_error**2
+            allowed = (tolerance * scale) ** 2 * total
+            # Half of what is left of the error for this level, the rest for the finer ones.
+            split = _worst(squared, 0.5 * max(allowed - settled, 0.0))
+            affordable = 0 if level == self._levels else (budget - len(self._keys)) // _NODES_A_SPLIT
+            if affordable < split.sum():
+                split[np.argsort(squared)[: len(split) - max(affordable, 0)]] = False
+            settled += float(squared[~split].sum())
+            if not split.any():
+                break
+            self.statistics.cells.append(int(split.sum()))
+            # The points of the split cells move on to the children. All eight are asked for: few more nodes than those that hold points,
+            # and the image meets places that no point has tried.
+            chosen = split[member]
+            local, weights, member = local[chosen], weights[chosen], (np.cumsum(split) - 1)[member[chosen]]
+            parents, before, blocks = coordinates[split], values[split], int(split.sum())
+            child = (local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[member]
+            member = 8 * member + child @ (1, 2, 4)
+            coordinates = (2 * parents[:, None] + _CORNERS).reshape(-1, 3)
+            continued = np.einsum("oci,pik->pock", _CHILD_WEIGHTS, before).reshape(8 * blocks, 8, self.fields)
+            values = self._corner_values(coordinates, level + 1)
+            known_error = np.sqrt(np.square(values - continued).max(axis=2).mean(axis=1) * (8 / 7)) / _GAIN
+            # Every split cell gets a block of eight leaves, and of eight entries of the table that its own now points at.
+            table[slots[split]] = -len(table) - 8 * np.arange(blocks)
+            slots = len(table) + np.arange(8 * blocks)
+            table = np.concatenate([table, count + np.arange(8 * blocks)])
+            leaves.append(values)
+            count += 8 * blocks
+        self.statistics.nodes = len(self._keys)
+        self.statistics.error = float(np.sqrt(settled / max(total, 1e-30)) / max(scale, 1e-30))
+        self._table = table.astype(np.int32)
+        self._leaves = np.concatenate(leaves).astype(np.float32)
+
+    def _scale(self, local: Array, member: Array, weights: Array, values: Array, coordinates: Array, level: int) -> float:
+        """Mean value over the points, of the largest field."""
+        fraction = local * 2.0**level - coordinates[member]
+        mean = np.einsum("pc,pck->pk", _trilinear(fraction), values[member]).T @ weights / max(float(weights.sum()), 1e-30)
+        return float(mean.max(initial=0.0))
+
+    def _corner_values(self, coordinates: Array, level: int) -> Array:
+        """Values (m, 8, k) at the corners of cells (m, 3) of a level, asking for those that are not known yet."""
+        corners = (coordinates[:, None] + _CORNERS) << (self._levels - level)
+        keys = corners[..., 0] | corners[..., 1] << _BITS | corners[..., 2] << 2 * _BITS
+        unique, inverse = np.unique(keys, return_inverse=True)
+        place = np.searchsorted(self._keys, unique)
+        found = np.zeros(len(unique), bool)
+        inside = place < len(self._keys)
+        found[inside] = self._keys[place[inside]] == unique[inside]
+        new = unique[~found]
+        mask = (1 << _BITS) - 1
+        fine = np.stack([new & mask, new >> _BITS & mask, new >> 2 * _BITS], axis=1)
+        values = self._evaluate(self.lattice.world(fine / 2.0**self._levels))
+        if self._known.shape[1] == 0:
+            self._known = np.empty((0, values.shape[1]), np.float32)
+        self._keys = np.concatenate([self._keys, new])
+        order = np.argsort(self._keys, kind="stable")
+        self._keys, self._known = self._keys[order], np.concatenate([self._known, values])[order]
+        result: Array = self._known[np.searchsorted(self._keys, unique)][inverse.reshape(keys.shape)]
+        return result
+
+    def _roots(self, coordinates: Array, values: Array) -> Array:
+        """Corner values of all root cells (m, 8, k); corners that nobody asked for take the mean of their neighbours."""
+        nx, ny, nz = (int(n) + 1 for n in self.lattice.size)
+        grid = np.zeros((nz, ny, nx, values.shape[2]), np.float32)
+        filled = np.zeros((nz, ny, nx), bool)
+        corners = (coordinates[:, None] + _CORNERS).reshape(-1, 3)
+        grid[corners[:, 2], corners[:, 1], corners[:, 0]] = values.reshape(len(corners), -1)
+        filled[corners[:, 2], corners[:, 1], corners[:, 0]] = True
+        while filled.any() and not filled.all():
+            total, count = np.zeros_like(grid), np.zeros(filled.shape, np.float32)
+            for axis in range(3):
+                for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+                    to = tuple(here if a == axis else slice(None) for a in range(3))
+                    come = tuple(there if a == axis else slice(None) for a in range(3))
+                    total[to] += grid[come] * filled[come][..., None]
+                    count[to] += filled[come]
+            fill = ~filled & (count > 0)
+            grid[fill] = total[fill] / count[fill][:, None]
+            filled |= fill
+        z, y, x = (a.ravel() for a in np.meshgrid(np.arange(nz - 1), np.arange(ny - 1), np.arange(nx - 1), indexing="ij"))
+        all_corners = np.stack([x, y, z], axis=1)[:, None] + _CORNERS
+        result: Array = grid[all_corners[..., 2], all_corners[..., 1], all_corners[..., 0]]
+        return result
+
+    def upload(self, types: Any) -> DeviceOctree:
+        """The same on the device, for lookups in kernels."""
+        return DeviceOctree(types, self.lattice, self._table, self._leaves)
+
+
+class DeviceOctree:
+    """Lookups of an `Octree` in Dr.Jit kernels."""
+
+    def __init__(self, types: Any, lattice: Lattice, table: Array, leaves: Array) -> None:
+        self.types, self.fields = types, leaves.shape[2]
+        self._table = types.Int32(table)
+        self._leaves = [types.Float(np.ascontiguousarray(leaves[:, :, k]).ravel()) for k in range(self.fields)]
+        turn = lattice.axes.T / lattice.spacing
+        self._turn = [[dr.opaque(types.Float, float(v)) for v in row] for row in turn]
+        self._shift = [dr.opaque(types.Float, float(v)) for v in -turn @ lattice.origin]
+        self._most = [dr.opaque(types.Float, float(n) - 1) for n in lattice.size]
+        nx, ny, _ = (int(n) for n in lattice.size)
+        self._row, self._plane = dr.opaque(types.Int32, nx), dr.opaque(types.Int32, nx * ny)
+
+    def to_local(self, points: Any) -> Any:
+        """World points to coordinates in root cells."""
+        rows = zip(self._turn, self._shift, strict=True)
+        return type(points)(*(dr.fma(points.x, r[0], dr.fma(points.y, r[1], dr.fma(points.z, r[2], s))) for r, s in rows))
+
+    def direction_to_local(self, directions: Any) -> Any:
+        """World vectors to root cells."""
+        return type(directions)(*(directions.x * r[0] + directions.y * r[1] + directions.z * r[2] for r in self._turn))
+
+    def lookup(self, local: Any, active: Any) -> list[Any]:
+        """Interpolated values, one Float a field, at coordinates in root cells; 0 for inactive lanes."""
+        types = self.types
+        root = [dr.clip(dr.floor(v), 0, most) for v, most in zip(local, self._most, strict=True)]
+        x, y, z = (dr.clip(v - r, 0, 1) for v, r in zip(local, root, strict=True))
+        place = types.Int32(root[0]) + types.Int32(root[1]) * self._row + types.Int32(root[2]) * self._plane
+        leaf, x, y, z = self._descend(dr.gather(types.Int32, self._table, place, active), x, y, z, active)
+        values = []
+        for leaves in self._leaves:
+            c = dr.gather(types.ArrayXf, leaves, leaf, active, shape=(8, dr.width(leaf)))
+            bottom = dr.lerp(dr.lerp(c[0], c[1], x), dr.lerp(c[2], c[3], x), y)
+            top = dr.lerp(dr.lerp(c[4], c[5], x), dr.lerp(c[6], c[7], x), y)
+            values.append(dr.lerp(bottom, top, z))
+        return values
+
+    @dr.syntax
+    def _descend(self, entry: Any, x: Any, y: Any, z: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """From a root cell's entry to the leaf below it that holds the place (x, y, z) of the unit cube, and the place in the leaf."""
+        types = self.types
+        while entry < 0:
+            right, up, far = x >= 0.5, y >= 0.5, z >= 0.5
+            octant = dr.select(right, types.Int32(1), 0) + dr.select(up, types.Int32(2), 0) + dr.select(far, types.Int32(4), 0)
+            x, y, z = 2 * x - dr.select(right, 1.0, 0.0), 2 * y - dr.select(up, 1.0, 0.0), 2 * z - dr.select(far, 1.0, 0.0)
+            entry = dr.gather(types.Int32, self._table, octant - entry, active)
+        return entry, x, y, z
+
+
+def _worst(squared: Array, allowed: float) -> Array:
+    """Which cells to split so that the errors of the others sum to no more than `allowed`."""
+    order = np.argsort(squared)
+    split = np.zeros(len(squared), bool)
+    split[order[np.cumsum(squared[order]) > allowed]] = True
+    return split
+
+
+def _trilinear(fraction: Array) -> Array:
+    """Weights (n, 8) of the corners at places (n, 3) in the unit cube."""
+    weights: Array = np.where(_CORNERS == 1, fraction[:, None], 1 - fraction[:, None]).prod(axis=2)
+    return weights
+
+
+# Corner c of child o of a cell, as a mixture of the cell's own corners: (octant, corner, parent's corner).
+_CHILD_WEIGHTS = np.stack([_trilinear(0.5 * (_CORNERS[o] + _CORNERS)) for o in range(8)]).astype(np.float32)
