@@ -135,7 +135,7 @@ def walk(field: Field, points: Singles, w: Singles, g: float, suns: Singles, wal
 
 
 def compile_seconds() -> float:
-    """Process time of the first call of our tracer, which compiles its kernel."""
+    """Process time of the first call of our tracer, which compiles its kernel or loads it from Dr.Jit's cache on disk."""
     field = Field(backend(), Volume.from_box(np.ones((2, 2, 2)), (0, 0, 0), (1, 1, 1)), 1.0)
     ahead = np.array([[0, 0, 1]], np.float32)
     return walk(field, np.full((1, 3), 0.5, np.float32), ahead, 0.0, np.repeat(ahead, SUNS, axis=0), 8192, 1)[1]

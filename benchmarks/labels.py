@@ -86,7 +86,7 @@ def run(size: Size, out: Path, page: Path | None) -> int:
     best = max(speeds, key=lambda v: speeds[v])
     mi.set_variant(best)
     variants = ", ".join(f"{v} {s:,.0f} paths/core-s" for v, s in speeds.items())
-    print(f"volpath: {variants}; {best} is used. Our kernel compiles once, in {compiling:.2f} core-s", flush=True)
+    print(f"volpath: {variants}; {best} is used. Our first call: {compiling:.2f} core-s", flush=True)
     rows = []
     for repetition in range(size.repetitions):
         for number, task in enumerate(tasks):
@@ -103,7 +103,10 @@ def run(size: Size, out: Path, page: Path | None) -> int:
     write_csv(out / "labels.csv", rows)
     plotted = write_plot(out / "labels.png", rows, worth)
     if page is not None:
-        notes = f"Measured on: {machine()}. volpath: {variants}; {best} is used. Our kernel compiles once, in {compiling:.1f} core-seconds."
+        notes = (
+            f"Measured on: {machine()}. volpath: {variants}; {best} is used. Our first call: {compiling:.2f} core-s "
+            "(kernels of earlier runs are cached on disk)."
+        )
         write_page(page, f"{notes}\n\n{tables}")
     print(f"\n{tables}\n\nwrote {out}/labels.csv" + (" and labels.png" if plotted else "; no plot: matplotlib is missing"))
     print(headline(rows))
