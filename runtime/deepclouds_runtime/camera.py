@@ -52,7 +52,9 @@ class Camera:
         if self._sensor.needs_aperture_sample():
             lens = mi.Point2f(numbers.number(stratified.LENS_U), numbers.number(stratified.LENS_V))
         ray, _ = self._sensor.sample_ray(mi.Float(self._sensor.shutter_open()), mi.Float(0.5), place, lens)
-        return plain(types, ray.o), plain(types, ray.d), plain(types, ray.maxt)
+        # Parallel rays share one direction; here every lane has its own.
+        direction = plain(types, ray.d) + dr.zeros(types.Array3f, dr.width(pixel))
+        return plain(types, ray.o), direction, plain(types, ray.maxt)
 
     def toward(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit vectors (n, 3) in which the camera sees world points (n, 3); through a lens, those of the rays through its middle."""

@@ -83,6 +83,8 @@ CLOUDS = (
 )
 SCENES = {
     "orthographic": replace(BASE, camera=ORTHOGRAPHIC, light=SUN + CONSTANT),
+    "orthographic, all orders": replace(BASE, camera=ORTHOGRAPHIC, max_depth=-1, spp=256),
+    "thin lens, all orders": replace(BASE, camera=THINLENS, max_depth=-1, spp=256),
     "thin lens": replace(BASE, camera=THINLENS),
     "thin lens, floor": replace(BASE, camera=THINLENS, surfaces=FLOOR),
     "crop": replace(BASE, film=FILM.format(24, 16, CROP)),
