@@ -127,8 +127,10 @@ def our_labels(field: Field, seconds: float, seed: int) -> Labels:
         return Labels(field, points[point], w[point], g[point], suns[point, sun], albedo[point, column], label.ravel(), spent)
 
     some(64, 1)
-    pilot = some(256, 2)
-    return some(max(16, int(256 * seconds / pilot.seconds)), seed)
+    # A pilot that is small beside the lanes in flight would find walks several times dearer than they are.
+    most = max(256, int(2700 * seconds))
+    pilot = some(most, 2)
+    return some(max(16, int(most * seconds / pilot.seconds)), seed)
 
 
 def volpath_labels(field: Field, seconds: float, seed: int) -> Labels:

@@ -143,7 +143,7 @@ def markdown(rows: Sequence[Row], worth: dict[str, Worth]) -> str:
     ours, theirs = worth["ours"], worth["volpath"]
     lines += [
         "",
-        "(b) The same small network (width 32) after training on labels from equal core-seconds; error on unseen clouds, free of the",
+        "(b) The same small network (width 32) after training on labels from at most equal core-seconds; error on unseen clouds, free of the",
         "reference's noise:",
         "",
         "| tracer | core-seconds | labels | rRMSE | energy |",
@@ -205,7 +205,7 @@ def write_plot(path: Path, rows: Sequence[Row], worth: dict[str, Worth]) -> bool
         right.bar(tracer, 100 * worth[tracer].rrmse, color=colours[tracer])
     left.set(yscale="log", ylabel="core-seconds", title="labels to 2 % standard error", xticks=range(len(names)), xticklabels=names)
     left.legend()
-    right.set(ylabel="rRMSE, %", title="network, equal core-s")
+    right.set(ylabel="rRMSE, %", title="network")
     with replacing(path, ".png") as temporary:
         figure.savefig(temporary, dpi=120)
     return True
