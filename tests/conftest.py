@@ -27,6 +27,20 @@ def public_scenes() -> Path:
     return folder
 
 
+@pytest.fixture(params=["llvm", "cuda"])
+def any_backend(request: pytest.FixtureRequest) -> ModuleType:
+    """The Dr.Jit types of each backend in turn; that of a GPU is skipped where there is none."""
+    from deepclouds.backend import backend
+    from deepclouds.errors import InputError
+
+    try:
+        return backend(request.param)
+    except InputError as error:
+        if request.param != "cuda":
+            raise
+        pytest.skip(str(error))
+
+
 @contextmanager
 def _variant(name: str) -> Iterator[ModuleType]:
     import mitsuba

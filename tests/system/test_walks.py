@@ -221,8 +221,8 @@ def test_lobes_of_one_kind_are_one_lobe() -> None:
     single = trace(field, points, w, 0.7, suns, [1.0], walks, seed=55)
     # One other row with two lobes makes the walks evaluate both lobes everywhere.
     mixed = np.concatenate([lobes(0.7, 60), lobes(TWO_LOBES)])
-    more = [np.concatenate([v, v[:1]]) for v in (points, w)]
-    both = trace_walks(field, *more, mixed, np.broadcast_to(suns, (61, 1, 3)), np.ones((61, 1), np.float32), walks, seed=55)
+    more = np.concatenate([points, points[:1]]), np.concatenate([w, w[:1]])
+    both = trace_walks(field, more[0], more[1], mixed, np.broadcast_to(suns, (61, 1, 3)), np.ones((61, 1), np.float32), walks, seed=55)
     np.testing.assert_allclose(both[:60], single, rtol=1e-5)
     for first, second in (((0.7, 0.7, 0.3), 0.7), ((0.9, -0.4, 0.75), (-0.4, 0.9, 0.25))):
         sets = [trace(field, points, w, p, suns, [1.0], walks, seed=s)[..., 0].astype(np.float64) for p, s in ((first, 56), (second, 57))]

@@ -23,12 +23,14 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
 from deepclouds.medium.multiple_scattering import trace_walks
 from deepclouds.medium.optical_depth import optical_depth
-from deepclouds.medium.phase import hg_numpy
+from deepclouds.medium.phase import as_lobes, hg_numpy
 from deepclouds.metrics import bright_mask, welch
 from deepclouds.volume import Volume
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+# A single lobe g, or the lobes (g1, g2, weight).
+Phase = float | tuple[float, float, float]
 # Every comparison of this file rejects a true null with at most this probability; the seeds are fixed, so it does so never or always.
 ALPHA = 1e-3
 
@@ -72,7 +74,7 @@ def device(values: NDArray[Any]) -> Any:
     return t.Array3f(*(t.Float(np.ascontiguousarray(values[:, c], np.float32)) for c in range(3)))
 
 
-def label_maps(name: str, g: float, walks: int, batches: int) -> tuple[Floats, Floats]:
+def label_maps(name: str, phase: Phase, walks: int, batches: int) -> tuple[Floats, Floats]:
     """Labels of the tracker and of volpath as stacks (batches, 8, 8, suns * albedos): 64 points, sorted along an axis, seen as an image."""
     volume, scale = VOLUMES[name]()
     unit = np.random.default_rng(61).uniform(-0.1, 1.1, (64, 3))
@@ -81,9 +83,9 @@ def label_maps(name: str, g: float, walks: int, batches: int) -> tuple[Floats, F
     w = unit_vectors(64, 62)
     suns = np.broadcast_to(unit_vectors(2, 63), (64, 2, 3))
     albedos = np.broadcast_to(np.array([1.0, 0.9], np.float32), (64, 2))
-    single = np.full(64, g, np.float32)
-    first = trace_walks(Field(backend(), volume, scale), points, w, single, suns, albedos, walks, seed=64)
-    second = trace_walks_mitsuba(volume, scale, points, w, single, suns, albedos, walks, seed=65)
+    lobes = np.repeat(as_lobes(np.array([phase])), 64, axis=0)
+    first = trace_walks(Field(backend(), volume, scale), points, w, lobes, suns, albedos, walks, seed=64)
+    second = trace_walks_mitsuba(volume, scale, points, w, lobes, suns, albedos, walks, seed=65)
     maps = [v.astype(np.float64).reshape(8, 8, batches, -1, 4).mean(axis=3).transpose(2, 0, 1, 3) for v in (first, second)]
     return maps[0], maps[1]
 
@@ -94,10 +96,10 @@ def relative_error(first: Floats, second: Floats) -> float:
     return float(np.sqrt(spread) / second.mean())
 
 
-@pytest.mark.parametrize("g", [0.6, 0.85])
+@pytest.mark.parametrize("phase", [0.6, 0.85, (0.8, -0.4, 0.75)])
 @pytest.mark.parametrize("name", ["cloud", "cube"])
-def test_labels_at_points(name: str, g: float) -> None:
-    first, second = label_maps(name, g, walks=2048, batches=32)
+def test_labels_at_points(name: str, phase: Phase) -> None:
+    first, second = label_maps(name, phase, walks=2048, batches=32)
     assert relative_error(first, second) < 0.025
     assert first.mean() > 0.1
     report = welch(first, second, tile=4)
