@@ -143,8 +143,8 @@ def markdown(rows: Sequence[Row], worth: dict[str, Worth]) -> str:
     ours, theirs = worth["ours"], worth["volpath"]
     lines += [
         "",
-        "(b) The same small network (width 32) after training on labels from at most equal core-seconds; error on unseen clouds, free of the",
-        "reference's noise:",
+        "(b) The same small network (width 32) after training on labels from at most equal core-seconds; error on unseen clouds,",
+        "free of the reference's noise:",
         "",
         "| tracer | core-seconds | labels | rRMSE | energy |",
         "|---|---|---|---|---|",
