@@ -52,22 +52,29 @@ check: setup-test
 bench: setup-bench
 	$(BIN)/python -m benchmarks.bench $(if $(SCENES),--scenes $(SCENES))
 
+# Makes a data set as one job shared by as many processes as there are processors, each of which does its part of the shards.
+generate = parts=$$(nproc); running=""; \
+  for part in $$(seq 0 $$((parts - 1))); do \
+    $(BIN)/deepclouds generate $(1) --shard $$part/$$parts & running="$$running $$!"; \
+  done; \
+  for process in $$running; do wait $$process || exit; done
+
 # Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
-	$(BIN)/deepclouds generate configs/labels.toml -o work/labels
+	$(call generate,configs/labels.toml -o work/labels)
 	if [ -e work/accurate_run/checkpoint.pt ]; then how=--resume; else how=configs/accurate.toml; fi; \
 	  $(BIN)/deepclouds train $$how -o work/accurate_run
 	$(BIN)/deepclouds export work/accurate_run -o work/accurate.onnx
 
 # The training labels and the held-out ones that a model is judged by; a tenth of the latter once more by Mitsuba's volpath.
 labels: setup-train
-	$(BIN)/deepclouds generate configs/labels.toml -o work/labels
+	$(call generate,configs/labels.toml -o work/labels)
 	for set in converged halves; do \
-	  $(BIN)/deepclouds generate configs/valid_$${set}_labels.toml -o work/valid_$$set || exit; \
-	  $(BIN)/deepclouds generate configs/valid_$${set}_labels.toml --tracer mitsuba -o work/valid_$${set}_volpath || exit; \
+	  $(call generate,configs/valid_$${set}_labels.toml -o work/valid_$$set); \
+	  $(call generate,configs/valid_$${set}_labels.toml --tracer mitsuba -o work/valid_$${set}_volpath); \
 	done
 
-bench-labels: setup-bench
+bench-labels: setup-test
 	$(BIN)/python -m benchmarks.labels
 
 setup: $(STAMPS)/installed
