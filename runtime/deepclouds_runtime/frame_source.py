@@ -7,9 +7,10 @@ smooth on the scale of a mean free path.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import numpy as np
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
-from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.lights import Beam, LightSource, Shade
 from deepclouds_runtime.march import depths
 from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_around
@@ -67,6 +67,14 @@ class FrameSource:
             terms = [value * dr.opaque(types.Float, float(m)) for value, m in zip(values, row, strict=True) if m != 0]
             result.append(sum(terms[1:], terms[0]) if terms else dr.zeros(types.Float, dr.width(values[0])))
         return result
+
+
+class Sees(Protocol):
+    """An eye: the camera, or anything else that sees every point in one direction."""
+
+    def toward(self, points: Array) -> Array:
+        """Unit vectors (n, 3), away from the eye, in which it sees world points (n, 3)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -151,7 +159,14 @@ def from_source(types: Any, source: LightSource, count: int, plain: bool, seed: 
 
 
 def frame_source(
-    cloud: Cloud, lights: Sequence[Arriving], camera: Camera, seen: Seen, root: float, tolerance: float, budget: int
+    cloud: Cloud,
+    lights: Sequence[Arriving],
+    eyes: Sequence[Sees],
+    seen: Seen,
+    root: float,
+    tolerance: float,
+    budget: int,
+    combine: Callable[[Array], Array] = operator.itemgetter(0),
 ) -> FrameSource | None:
     """J of a frame; None where it is 0 everywhere.
 
@@ -161,28 +176,30 @@ def frame_source(
         the medium; its `scattering` is the network.
     lights
         where light comes from.
-    camera
-        tells in which direction each point is seen.
+    eyes
+        tell in which direction each point is seen: the camera alone, as a rule.
     seen
         what the camera sees.
     root
         edge of the coarsest cells in units of length (mean free paths).
     tolerance, budget
         see `Octree`; `budget` counts queries.
+    combine
+        makes the fields (n, l) that are interpolated of the values (eyes, n, k).
     """
     network = cloud.scattering
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
     if not albedos or not lights or not len(seen.points) or not isinstance(network, NetworkScattering) or network.descriptor.empty:
         return None
     field = cloud.field
-    predicted = _Predicted(cloud, network, lights, albedos, camera)
+    predicted = _Predicted(cloud, network, lights, albedos, eyes, combine)
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
     lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, root * network.descriptor.unit)
-    nodes = max(1, budget // (len(lights) * len(albedos)))
+    nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
-    checks = min(max(_LEAST_CHECKS, _CHECKS // len(lights)), len(seen.points) // 2)
+    checks = min(max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes))), len(seen.points) // 2)
     held_out, built_for = _split(seen, checks)
     octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS)
     device = octree.upload(field.types)
@@ -194,9 +211,15 @@ class _Predicted:
     """What the octree interpolates: the network's j summed over lights, one field for each different albedo or for each colour channel."""
 
     def __init__(
-        self, cloud: Cloud, network: NetworkScattering, lights: Sequence[Arriving], albedos: tuple[float, ...], camera: Camera
+        self,
+        cloud: Cloud,
+        network: NetworkScattering,
+        lights: Sequence[Arriving],
+        albedos: tuple[float, ...],
+        eyes: Sequence[Sees],
+        combine: Callable[[Array], Array],
     ) -> None:
-        self._cloud, self._network, self._lights, self._albedos, self._camera = cloud, network, lights, albedos, camera
+        self._cloud, self._network, self._lights, self._albedos, self._eyes, self._combine = cloud, network, lights, albedos, eyes, combine
         self.queries = 0
         square = np.array(cloud.albedo) ** 2 / (4 * math.pi)
         tint = _tint(lights)
@@ -214,30 +237,31 @@ class _Predicted:
             self._of_field = list(range(len(albedos)))
 
     def __call__(self, points: Array) -> Array:
-        """Fields (n, k) at world points (n, 3)."""
+        """Fields (n, l) at world points (n, 3)."""
         n = len(points)
-        total = np.zeros((n, self.mix.shape[1]), np.float32)
+        total = np.zeros((len(self._eyes), n, self.mix.shape[1]), np.float32)
+        pairs = [(e, light) for e in range(len(self._eyes)) for light in self._lights]
         at_once = max(1, _AT_ONCE // max(n, 1))
-        for first in range(0, len(self._lights), at_once):
-            self._add(points, self._lights[first : first + at_once], total)
-        return total
+        for first in range(0, len(pairs), at_once):
+            self._add(points, pairs[first : first + at_once], total)
+        return self._combine(total)
 
-    def _add(self, points: Array, lights: Sequence[Arriving], total: Array) -> None:
+    def _add(self, points: Array, pairs: Sequence[tuple[int, Arriving]], total: Array) -> None:
         types, field, n = self._cloud.field.types, self._cloud.field, len(points)
-        w = self._camera.toward(points)
-        x, d = (_upload(types, np.tile(v, (len(lights), 1))) for v in (points, w))
-        omega = _upload(types, np.repeat([light.omega for light in lights], n, axis=0))
+        x = _upload(types, np.tile(points, (len(pairs), 1)))
+        d = _upload(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
+        omega = _upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
         tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), _DEEP)
         dr.eval(tau)
-        j = self._network(x, d, omega, self._cloud.phase, self._albedos, tau).reshape(len(lights), n, -1)
+        j = self._network(x, d, omega, self._cloud.phase, self._albedos, tau).reshape(len(pairs), n, -1)
         self.queries += j.size
         x = _upload(types, points)
-        for light, values in zip(lights, j, strict=True):
+        for (e, light), values in zip(pairs, j, strict=True):
             arriving = light.at(x)
             dr.eval(arriving)
             for f, k in enumerate(self._of_field):
                 if k >= 0:
-                    total[:, f] += np.array(arriving[f if self._brightest < 0 else self._brightest]) * values[:, k]
+                    total[e, :, f] += np.array(arriving[f if self._brightest < 0 else self._brightest]) * values[:, k]
 
 
 def _upload(types: Any, values: Array) -> Any:

@@ -16,6 +16,7 @@ from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
+from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
@@ -46,6 +47,8 @@ _PILOT, _PILOT_DEPTHS = 1 << 16, 4
 _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
 _BEAMS, _BRIGHT = 48, 0.1
+# The same for light that the cloud throws on surfaces.
+_BEAMS_THROWN = 12
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Collisions of a camera ray that get shadow rays.
@@ -189,9 +192,11 @@ class Renderer:
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering), self._lights()
         work = _Work(scene, Camera(types, scene.sensor), cloud, lights, lights, types, seed, self._interreflection)
         work.spent("lights", started)
+        if fast and self._interreflection:
+            work.prepare_thrown(_INTERPOLATION * error)
         if self._interreflection:
             clock = time.perf_counter()
-            reflectors = Reflectors(cloud, lights, seed & 0xFFFFFFFF, work.counts)
+            reflectors = Reflectors(work.thrower, lights, seed & 0xFFFFFFFF, work.counts)
             work.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
             work.spent("probe", clock)
         if fast:
@@ -237,17 +242,63 @@ class _Work:
     sums: dict[str, Image] = field(default_factory=dict)
     samples: int = 0
     sources: list[FrameSource] | None = None
+    all_round: AllRound | None = None
+
+    @property
+    def thrower(self) -> Cloud:
+        """The cloud as surfaces see it."""
+        return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round)
+
+    def prepare_thrown(self, tolerance: float) -> None:
+        """Predict multiple scattering for the light that the cloud throws on surfaces; from then on their rays ask no network."""
+        clock = time.perf_counter()
+        types = self.types
+        lower, upper = self.cloud.field.volume.bounds
+        middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
+        radius = 0.5 * float(np.linalg.norm(upper - lower))
+        pixel, numbers = self._pilot(_PILOT // 8)
+        origin, direction, _ = self.camera.rays(pixel, numbers)
+        # What the camera sees of the surfaces, and what the middle of the cloud sees of them: the probe stands there.
+        around = spread(_PILOT // 8).astype(np.float32)
+        out = types.Array3f(*(types.Float(np.ascontiguousarray(around[:, c])) for c in range(3)))
+        parts = []
+        for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
+            interaction, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
+            found: Any = dr.compress(shown)
+            place = dr.fma(ahead, distance, start)
+            parts.append([np.array(dr.gather(types.Float, v, found)) for v in place])
+            del interaction
+        places = np.concatenate([np.stack(part, axis=1) for part in parts])
+        if len(places):
+            # Toward points spread through the cloud's sphere.
+            aims = np.array(0.5 * (lower + upper)) + radius * np.cbrt((np.arange(len(places)) * 0.6180339887) % 1)[:, None] * np.roll(
+                spread(len(places)), len(places) // 3, axis=0
+            )
+            ahead = aims - places
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
+            o, d = (types.Array3f(*(types.Float(np.ascontiguousarray(v[:, c], np.float32)) for c in range(3))) for v in (places, ahead))
+            end = dr.full(types.Float, math.inf, len(places))
+            seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
+            lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
+            for source, _ in self.on_surfaces.sources:
+                lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
+            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, 2 * tolerance, _BUDGET)
+            self.counts.queries += self.all_round.queries
+        self.spent("light on surfaces", clock)
+
+    def _pilot(self, most: int) -> tuple[Any, Stratified]:
+        """Pixels spread over the image, no more than `most`, and random numbers for them."""
+        width, height = self.scene.size
+        stride = math.ceil(math.sqrt(width * height / most))
+        columns, rows = np.arange(0, width, stride), np.arange(0, height, stride)
+        pixel = self.types.UInt32((rows[:, None] * width + columns).ravel().astype(np.uint32))
+        one = dr.opaque(self.types.UInt32, 1)
+        return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
 
     def prepare(self, tolerance: float) -> None:
         """Predict multiple scattering for this camera; from then on camera rays ask no network."""
         clock = time.perf_counter()
-        width, height = self.scene.size
-        stride = math.ceil(math.sqrt(width * height / _PILOT))
-        columns, rows = np.arange(0, width, stride), np.arange(0, height, stride)
-        pixel = self.types.UInt32((rows[:, None] * width + columns).ravel().astype(np.uint32))
-        numbers = Stratified(
-            self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), dr.opaque(self.types.UInt32, 1), self._seed()
-        ).unrelated()
+        pixel, numbers = self._pilot(_PILOT)
         origin, direction, end = self.camera.rays(pixel, numbers)
         if self.scene.surfaces is not None:
             _, end, _ = self._surfaces(origin, direction, end)
@@ -263,8 +314,8 @@ class _Work:
         suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
         around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
         found = [
-            frame_source(self.cloud, suns, self.camera, seen, _ROOT, tolerance, _BUDGET),
-            frame_source(self.cloud, around, self.camera, seen, _ROOT_AROUND, tolerance, _BUDGET),
+            frame_source(self.cloud, suns, [self.camera], seen, _ROOT, tolerance, _BUDGET),
+            frame_source(self.cloud, around, [self.camera], seen, _ROOT_AROUND, tolerance, _BUDGET),
         ]
         self.sources = [source for source in found if source is not None]
         self.counts.queries += sum(source.queries for source in self.sources)
@@ -324,7 +375,7 @@ class _Work:
             colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
             if self.interreflection:
                 weight = dr.select(shown, through, 0)
-                thrown = reflected_from_cloud(self.cloud, self.on_cloud, interaction, weight, numbers, self.counts)
+                thrown = reflected_from_cloud(self.thrower, self.on_cloud, interaction, weight, numbers, self.counts)
                 colours = [a + b for a, b in zip(colours, thrown, strict=True)]
             self._collect(where, "surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)

@@ -56,12 +56,15 @@ class Cloud:
         phase function (g1, g2, weight), see `deepclouds.medium.phase`.
     scattering
         source of J, or None for single scattering alone.
+    known
+        J of each colour channel as a function of points and directions, where it is known without `scattering`.
     """
 
     field: Field
     albedo: tuple[float, ...]
     phase: tuple[float, float, float]
     scattering: MultipleScattering | None
+    known: Callable[[Any, Any], list[Any]] | None = None
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,8 @@ def _scatter(
     target = dr.gather(types.UInt32, lanes, queries)
 
     def predict(omega: Any, radiance: list[Any], tau: Any) -> None:
-        if cloud.scattering is not None and len(queries):
+        if len(queries):
+            assert cloud.scattering is not None
             different = tuple(sorted(set(cloud.albedo)))
             counts.queries += len(queries) * len(different)
             counts.skipped += (len(lanes) - len(queries)) * len(different)
@@ -193,7 +197,10 @@ def _scatter(
                 value = value * (albedo[c] * albedo[c] * (0.25 / dr.pi)) * weight * take(radiance[c])
                 dr.scatter_add(result.indirect[c], value, target)
 
-    direct = single_scattering(cloud, lights, points, w, numbers, predict)
+    direct = single_scattering(cloud, lights, points, w, numbers, None if cloud.scattering is None else predict)
+    if cloud.known is not None:
+        for total, value in zip(result.indirect, cloud.known(points, w), strict=True):
+            dr.scatter(total, value * opacity, lanes)
     for c in range(channel_count):
         dr.scatter(result.direct[c], direct[c] * opacity, lanes)
 
