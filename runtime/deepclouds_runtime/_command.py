@@ -61,7 +61,11 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("input", metavar="INPUT", help="scene.xml, cloud.vdb or cloud.vol")
     parser.add_argument("-o", "--output", metavar="OUT.exr", type=Path, required=True, help="image to write")
-    parser.add_argument("--spp", type=_positive, help="samples a pixel (default: the scene's; 12 for a volume)")
+    parser.add_argument("--spp", type=_positive, help="samples a pixel (default: as many as --error asks for)")
+    parser.add_argument("--error", type=float, help="noise of a pixel to aim at, as a share of the mean (default 0.02)")
+    parser.add_argument(
+        "--mode", choices=("fast", "reference"), default="fast", help="reference: every sample asks the network (default %(default)s)"
+    )
     parser.add_argument("--seed", type=_seed, default=0, help="of all random numbers (default %(default)s)")
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with deepclouds)")
     parser.add_argument(
@@ -124,7 +128,7 @@ def run(argv: Sequence[str], prog: str) -> int:
     options: dict[str, Any] = {k: getattr(arguments, k) for k in (*_VOLUME, *_BOTH, "sensor", "grid") if getattr(arguments, k) is not None}
     if arguments.clamp:
         options["clamp"] = True
-    how: dict[str, Any] = {"multiple": arguments.multiple, "interreflection": not arguments.no_interreflection}
+    how: dict[str, Any] = {"mode": arguments.mode, "multiple": arguments.multiple, "interreflection": not arguments.no_interreflection}
     if arguments.env_directions is not None:
         how["environment_directions"] = arguments.env_directions
 
@@ -142,7 +146,8 @@ def run(argv: Sequence[str], prog: str) -> int:
     say: Callable[[str], None] = (lambda text: None) if arguments.quiet else print
     _describe(renderer, say)
     with _progress(arguments.quiet) as progress:
-        result = renderer.render(arguments.spp, arguments.seed, progress)
+        dial = {} if arguments.error is None else {"error": arguments.error}
+        result = renderer.render(arguments.spp, arguments.seed, progress, **dial)
     sensor = renderer.scene.sensor
     parameters = mitsuba().traverse(sensor)
     camera: dict[str, Any] = {
@@ -159,7 +164,8 @@ def run(argv: Sequence[str], prog: str) -> int:
         "version": version("deepclouds"),
         "mitsuba_variant": mitsuba().variant(),
         "input": arguments.input,
-        "spp": renderer.samples(arguments.spp),
+        "spp": result.statistics.spp,
+        "error": arguments.error,
         "seed": arguments.seed,
         "defines": defines,
         "options": options,
@@ -218,10 +224,19 @@ def _phase_words(phase: tuple[float, float, float]) -> str:
 
 
 def _report(result: RenderResult, say: Callable[[str], None]) -> None:
-    stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in result.seconds.items())
-    counts = asdict(result.counts)
-    say(f"time: {stages}")
-    say(", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in counts.items()))
+    statistics = result.statistics
+    rows = [("mode", statistics.mode), ("samples a pixel", f"{statistics.spp:,}")]
+    if statistics.noise is not None:
+        rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
+    for name, source in statistics.sources.items():
+        took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
+        rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
+    rows += [(name.replace("_", " "), f"{value:,}") for name, value in asdict(result.counts).items() if name != "skipped"]
+    rows += [(f"no query: {name}", f"{value:,}") for name, value in statistics.skipped.items()]
+    rows += [(f"time: {name}", f"{seconds:.2f} s") for name, seconds in result.seconds.items()]
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        say(f"{name.ljust(width)}  {value}")
 
 
 @contextmanager

@@ -49,27 +49,34 @@ class AllRound:
         points of the cloud that surfaces see.
     root, tolerance, budget
         see `frame_source`.
+
+    Attributes
+    ----------
+    source
+        harmonics of J at the nodes, or None where it is 0 everywhere.
+    queries
+        asked of the network.
     """
 
     def __init__(self, cloud: Cloud, lights: Sequence[Arriving], seen: Seen, root: float, tolerance: float, budget: int) -> None:
-        self._source: FrameSource | None = frame_source(
+        self.source: FrameSource | None = frame_source(
             cloud, lights, [Direction(w) for w in spread(DIRECTIONS)], seen, root, tolerance, budget, fit
         )
         self._channels, self._types = len(cloud.albedo), cloud.field.types
-        self.queries = 0 if self._source is None else self._source.queries
+        self.queries = 0 if self.source is None else self.source.queries
 
     def __call__(self, points: Any, w: Any) -> list[Any]:
         """J of every colour channel at points (Array3f) seen along unit vectors `w`."""
-        if self._source is None:
+        if self.source is None:
             return [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
-        octree = self._source.octree
+        octree = self.source.octree
         values = octree.lookup(octree.to_local(points), self._types.Bool(True))
         basis = harmonics(w.x, w.y, w.z)
         sums = []
         for f in range(len(values) // _HARMONICS):
             terms = [b * v for b, v in zip(basis, values[f * _HARMONICS : (f + 1) * _HARMONICS], strict=True)]
             sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
-        return self._source.colours(sums)
+        return self.source.colours(sums)
 
 
 def spread(count: int) -> Array:

@@ -51,6 +51,8 @@ class FrameSource:
         of the interpolation at a point that the camera sees, measured: root of the mean square over the mean.
     queries
         asked of the network.
+    lights
+        directions that light comes from.
     """
 
     octree: DeviceOctree
@@ -58,6 +60,12 @@ class FrameSource:
     statistics: Statistics
     error: float
     queries: int
+    lights: int
+
+    def summary(self) -> dict[str, Any]:
+        """What it took, for a report."""
+        made = self.statistics
+        return {"lights": self.lights, "nodes": made.nodes, "queries": self.queries, "refined": made.cells, "error": round(self.error, 4)}
 
     def colours(self, values: list[Any]) -> list[Any]:
         """Colour channels of sums over the fields."""
@@ -204,7 +212,7 @@ def frame_source(
     octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS)
     device = octree.upload(field.types)
     factor, error = _audit(device, predicted, held_out)
-    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries)
+    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights))
 
 
 class _Predicted:

@@ -8,6 +8,8 @@
 | model | string | path of a network, or the name of a released one (default: the one that comes with the package) |
 | environment_directions | integer | directions drawn from an environment at each sample of the cloud (default 2) |
 | interreflection | boolean | light that surfaces and cloud throw on each other, one reflection each (default true) |
+| mode | string | `fast` (default), or `reference`: every sample asks the network |
+| error | float | of the fast mode without a number of samples: noise of a pixel to aim at over the mean (default 0.02) |
 | multiple | string | `network` (default), or `walks`: Monte Carlo in place of the network, for tests and references |
 
 The plugin exists in Python, after ``import deepclouds_runtime``, in the variants ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_rgb`` and
@@ -66,6 +68,8 @@ def _integrator_class(mi: Any) -> Any:
             self.model = str(properties.get("model", "")) or None
             self.environment_directions = int(properties.get("environment_directions", 2))
             self.interreflection = bool(properties.get("interreflection", True))
+            self.mode = str(properties.get("mode", "fast"))
+            self.error = float(properties.get("error", 0.02))
             self.multiple = str(properties.get("multiple", "network"))
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
@@ -82,9 +86,10 @@ def _integrator_class(mi: Any) -> Any:
                 multiple=self.multiple,
                 environment_directions=self.environment_directions,
                 interreflection=self.interreflection,
+                mode=self.mode,
                 load_seconds=time.perf_counter() - started,
             )
-            result = renderer.render(spp if spp > 0 else None, int(np.ravel(np.array(seed))[0]))
+            result = renderer.render(spp if spp > 0 else None, int(np.ravel(np.array(seed))[0]), error=self.error)
             return _develop(mi, read.sensor.film(), result, develop)
 
         def to_string(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from os import PathLike
 from typing import Any
 
@@ -53,7 +54,15 @@ def save(
     record = {k: v for k, v in (settings or {}).items() if v is not None}
     attributes: dict[str, str | float | int] = {
         "software": "deepclouds",
-        ATTRIBUTE: json.dumps({**record, "seconds": {k: round(v, 4) for k, v in result.seconds.items()}, "notes": list(result.notes)}),
+        ATTRIBUTE: json.dumps(
+            {
+                **record,
+                "seconds": {k: round(v, 4) for k, v in result.seconds.items()},
+                "counts": asdict(result.counts),
+                "statistics": asdict(result.statistics),
+                "notes": list(result.notes),
+            }
+        ),
     }
     if "model_hash" in record:
         attributes["modelHash"] = str(record["model_hash"])

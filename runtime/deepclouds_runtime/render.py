@@ -17,6 +17,7 @@ def render(
     defines: Mapping[str, str] | None = None,
     model: str | PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
+    error: float = 0.02,
     **options: Any,
 ) -> RenderResult:
     """Render a cloud with its multiple scattering predicted by the network.
@@ -26,7 +27,7 @@ def render(
     input
         a path to a Mitsuba scene (.xml) or a volume (.vdb, .vol), or a loaded ``mitsuba.Scene``.
     spp
-        samples a pixel; by default those of the camera's sampler.
+        samples a pixel; by default as many as `error` asks for.
     seed
         of all random numbers.
     defines
@@ -35,6 +36,8 @@ def render(
         path of the network; None takes the one that comes with the package.
     progress
         is called with the share of the work done, 0 to 1.
+    error
+        noise of a pixel to aim at, root of the mean square over the mean.
     **options
         see `deepclouds_runtime.loading.load`.
 
@@ -54,7 +57,7 @@ def render(
     """
     from deepclouds_runtime.loading import load
 
-    return load(input, defines=defines, model=model, **options).render(spp, seed, progress)
+    return load(input, defines=defines, model=model, **options).render(spp, seed, progress, error)
 
 
 def main(argv: Sequence[str], prog: str = "deepclouds render") -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -27,6 +28,7 @@ from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.surfaces import Reflectors, reflected, reflected_from_cloud
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
+_LOG = logging.getLogger(__name__)
 Image = NDArray[np.float32]
 
 # Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB.
@@ -59,6 +61,32 @@ LAYERS = ("volume_direct", "volume_indirect", "surface", "background")
 
 
 @dataclass
+class Statistics:
+    """How an image came about.
+
+    Attributes
+    ----------
+    mode
+        ``"fast"`` or ``"reference"``.
+    spp
+        samples a pixel.
+    noise
+        estimated noise of a pixel, root of the mean square over the mean, where the image is not dark; None where one round was asked for.
+    sources
+        name of a source of multiple scattering -> what it took: ``lights`` it stands for, ``nodes`` predicted, ``queries``, ``refined``
+        cells level by level, and ``error`` of the interpolation at a point, measured.
+    skipped
+        reason -> queries that were not needed.
+    """
+
+    mode: str
+    spp: int = 0
+    noise: float | None = None
+    sources: dict[str, dict[str, Any]] = field(default_factory=dict)
+    skipped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass
 class RenderResult:
     """An image with its parts.
 
@@ -75,6 +103,8 @@ class RenderResult:
         stage -> seconds; ``load`` is what was done once, ``total`` all the rest.
     counts
         camera samples, those that met the cloud, network queries made and skipped.
+    statistics
+        samples, nodes, and estimated errors.
     notes
         what was approximated, in sentences.
     """
@@ -84,6 +114,7 @@ class RenderResult:
     channels: dict[str, Image]
     seconds: dict[str, float]
     counts: Counts
+    statistics: Statistics
     notes: tuple[str, ...] = ()
 
 
@@ -205,6 +236,8 @@ class Renderer:
         if spp is not None or not fast:
             work.round(0, most, most, progress)
         else:
+            asked = int(scene.sensor.sampler().sample_count())
+            _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
             while work.samples < most and not noise <= error:
                 before, done = work.beauty(), work.samples
                 size = 1 if done < 2 else math.ceil(done * (min(noise / error, 4.0) ** 1.5 - 1))
@@ -214,7 +247,12 @@ class Renderer:
         channels = work.image()
         seconds = {"load": self._load_seconds, **work.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
-        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, scene.notes)
+        statistics = Statistics("fast" if fast else "reference", work.samples, noise if math.isfinite(noise) else None)
+        for name, source in (*work.named.items(), ("light on surfaces", None if work.all_round is None else work.all_round.source)):
+            if source is not None:
+                statistics.sources[name] = source.summary()
+        statistics.skipped = work.skipped()
+        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, statistics, scene.notes)
 
     def _lights(self) -> Lights:
         """The lights, with the tables that depend on them: made anew for each render."""
@@ -242,7 +280,20 @@ class _Work:
     sums: dict[str, Image] = field(default_factory=dict)
     samples: int = 0
     sources: list[FrameSource] | None = None
+    named: dict[str, FrameSource] = field(default_factory=dict)
     all_round: AllRound | None = None
+
+    def skipped(self) -> dict[str, int]:
+        """Queries that were not needed, by reason; a sample counts as the one query that the reference mode would ask."""
+        if self.sources is None:
+            return {"thin samples": self.counts.skipped}
+        distinct = len({a for a in self.cloud.albedo if a > 0})
+        return {
+            "samples that met no cloud": self.counts.camera_samples - self.counts.cloud_samples,
+            "samples interpolated": self.counts.cloud_samples,
+            "equal colour channels": sum(s.queries for s in self.sources) // max(distinct, 1) * (len(self.cloud.albedo) - distinct),
+            "suns without power": sum(max(sun.irradiance) <= 0 for sun in self.on_cloud.suns),
+        }
 
     @property
     def thrower(self) -> Cloud:
@@ -313,11 +364,12 @@ class _Work:
         power = sum(max(light.irradiance) for light in around)
         suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
         around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
-        found = [
-            frame_source(self.cloud, suns, [self.camera], seen, _ROOT, tolerance, _BUDGET),
-            frame_source(self.cloud, around, [self.camera], seen, _ROOT_AROUND, tolerance, _BUDGET),
-        ]
-        self.sources = [source for source in found if source is not None]
+        found = {
+            "suns": frame_source(self.cloud, suns, [self.camera], seen, _ROOT, tolerance, _BUDGET),
+            "light from all around": frame_source(self.cloud, around, [self.camera], seen, _ROOT_AROUND, tolerance, _BUDGET),
+        }
+        self.named = {name: source for name, source in found.items() if source is not None}
+        self.sources = list(self.named.values())
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
 
