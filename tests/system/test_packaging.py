@@ -17,7 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-COMMANDS = {"info", "compare", "clouds", "generate", "dataset", "train", "export", "render"}
+COMMANDS = {"info", "compare", "clouds", "generate", "dataset", "train", "export", "evaluate", "render", "verify"}
 
 
 @pytest.fixture(scope="module")
