@@ -50,8 +50,10 @@ def moved(volume: Volume, matrix: NDArray[np.float64], shift: NDArray[np.float64
     return Volume(volume.density, to_world)
 
 
-def kernel(volume: Volume, scale: float, *arguments: NDArray[np.float64]) -> NDArray[np.float32]:
-    return Descriptor(Field(backend("llvm"), volume, scale)).stencils_numpy(*arguments)
+def kernel(
+    volume: Volume, scale: float, points: NDArray[np.float64], w: NDArray[np.float64], sun: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    return Descriptor(Field(backend("llvm"), volume, scale)).stencils_numpy(points, w, sun)
 
 
 @pytest.mark.parametrize("scale", [1.0, 20.0, 3000.0])

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +81,7 @@ class Figure:
         return f"{100 * self.value:+.2f} % [{100 * self.low:+.2f}, {100 * self.high:+.2f}]"
 
 
-def predict_labels(model: Path, data: Path, backend: str = "llvm") -> Labels:
+def predict_labels(model: Path, data: Path, backend: Literal["llvm", "cuda"] = "llvm") -> Labels:
     """Ask a model for every label of the held-out clouds of a data set.
 
     Raises

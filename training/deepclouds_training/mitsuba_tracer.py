@@ -125,6 +125,7 @@ def scene_dict(volume: Volume, scale: float, phase: ArrayLike, omega_sun: ArrayL
     if np.linalg.det(volume.to_world[:3, :3]) < 0:
         half[0, 0] = -0.5
     grid = mi.VolumeGrid(np.ascontiguousarray(volume.density[..., None]))
+    cube_to_world: Any = volume.to_world @ half
     return {
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": -1, "rr_depth": 1_000_000},
@@ -135,7 +136,7 @@ def scene_dict(volume: Volume, scale: float, phase: ArrayLike, omega_sun: ArrayL
         },
         "box": {
             "type": "cube",
-            "to_world": mi.ScalarTransform4f(volume.to_world @ half),
+            "to_world": mi.ScalarTransform4f(cube_to_world),
             "bsdf": {"type": "null"},
             "interior": {
                 "type": "heterogeneous",
