@@ -1,0 +1,166 @@
+"""The octree of nodes, the marches that use it, and the directions that stand for a sky."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from deepclouds_runtime.all_round import DIRECTIONS, fit, harmonics, spread
+from deepclouds_runtime.lights import median_cut
+from deepclouds_runtime.march import depths, gathered
+from deepclouds_runtime.octree import Lattice, Octree, lattice_around
+from numpy.typing import NDArray
+
+from deepclouds.backend import backend
+from deepclouds.medium.field import Field
+from deepclouds.medium.optical_depth import optical_depth
+from deepclouds.volume import Volume
+
+types = backend("llvm")
+BOX = np.array([2.0, 1.4, 1.0])
+TURN = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+CORNER = np.array([0.3, -1.0, 2.0])
+
+
+def _points(n: int, seed: int) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = np.random.default_rng(seed).random((n, 3)) * BOX @ TURN.T + CORNER
+    return result
+
+
+def _lattice(spacing: float) -> Lattice:
+    return lattice_around(BOX, CORNER, TURN, spacing)
+
+
+def _upload(values: NDArray[np.float64]) -> types.Array3f:  # type: ignore[valid-type]
+    return types.Array3f(np.ascontiguousarray(values.T, np.float32))
+
+
+def _lookup(octree: Octree, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    device = octree.upload(types)
+    return np.array([np.array(v) for v in device.lookup(device.to_local(_upload(points)), types.Bool(True))], np.float64).T
+
+
+def _bump(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    local = (points - CORNER) @ TURN
+    return np.stack([1 + np.exp(-20 * np.sum((local - 0.5) ** 2, axis=1)), 2 + local[:, 0]], axis=1).astype(np.float32)
+
+
+def test_a_linear_function_is_met_exactly_wherever_it_is_asked() -> None:
+    """Even where no point lay when the octree was built: in cells it never asked about it goes on from the neighbours' corners."""
+
+    def linear(points: NDArray[np.float64]) -> NDArray[np.float32]:
+        return (points @ np.array([[1.0], [2.0], [-0.5]]) + 9).astype(np.float32)
+
+    points = _points(500, 1)
+    octree = Octree(_lattice(0.3), linear, points, np.ones(len(points)), 1e-6, 10**6, 2)
+    tried = _points(300, 2)
+    np.testing.assert_allclose(_lookup(octree, tried), linear(tried), rtol=1e-5)
+
+
+def test_a_smaller_tolerance_gives_a_smaller_error_for_more_nodes() -> None:
+    points, tried = _points(8000, 3), _points(4000, 4)
+    errors, nodes = [], []
+    for tolerance in (0.1, 0.02, 0.005):
+        octree = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), tolerance, 10**6, 8)
+        found = _lookup(octree, tried)
+        errors.append(float(np.sqrt(np.mean((found[:, 0] - _bump(tried)[:, 0]) ** 2)) / found[:, 0].mean()))
+        nodes.append(octree.statistics.nodes)
+        # The estimate may err by a factor, not by an order of magnitude.
+        assert octree.statistics.error <= tolerance
+        assert errors[-1] < 2 * tolerance
+    assert errors[0] > errors[1] > errors[2]
+    assert nodes[0] < nodes[1] < nodes[2]
+
+
+def test_nodes_gather_where_the_function_bends() -> None:
+    points = _points(8000, 5)
+    asked: list[NDArray[np.float64]] = []
+
+    def kept(places: NDArray[np.float64]) -> NDArray[np.float32]:
+        asked.append(places)
+        return _bump(places)
+
+    Octree(_lattice(0.25), kept, points, np.ones(len(points)), 5e-4, 10**6, 8)
+    local = (np.concatenate(asked) - CORNER) @ TURN
+    near = np.linalg.norm(local - 0.5, axis=1) < 0.4
+    ball, box = 4 / 3 * math.pi * 0.4**3, float(BOX.prod())
+    assert near.mean() > 2 * ball / box
+
+
+def test_the_budget_bounds_the_nodes() -> None:
+    points = _points(8000, 6)
+    free = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), 1e-4, 10**6, 8).statistics.nodes
+    bounded = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), 1e-4, 1000, 8).statistics.nodes
+    assert free > 3000
+    assert bounded < 1500
+
+
+def _ball() -> tuple[Field, NDArray[np.float64], NDArray[np.float64]]:
+    c = (np.arange(12) + 0.5) / 6 - 1
+    z, y, x = np.meshgrid(c, c, c, indexing="ij")
+    volume = Volume.from_box(np.clip(1.2 - np.sqrt(x * x + y * y + z * z), 0, 1).astype(np.float32), (-1, -1, -1), (1, 1, 1))
+    rng = np.random.default_rng(7)
+    origin = np.concatenate([rng.uniform(-0.8, 0.8, (400, 2)), np.full((400, 1), -3.0)], axis=1)
+    return Field(types, volume, 6.0), origin, np.broadcast_to([0.0, 0.0, 1.0], origin.shape)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_a_source_of_one_adds_up_to_what_the_ray_hides(scale: float) -> None:
+    ball, origin, direction = _ball()
+    field = Field(types, ball.volume, 6.0 * scale)
+    lattice = lattice_around(np.full(3, 2.0), np.full(3, -1.0), np.eye(3), 0.5)
+    points = np.random.default_rng(8).uniform(-1, 1, (500, 3))
+    octree = Octree(lattice, lambda p: np.ones((len(p), 1), np.float32), points, np.ones(500), 0.1, 10**6, 1).upload(types)
+    o, d, far = _upload(origin), _upload(direction), types.Float(math.inf)
+    jitter = types.Float(0.3)
+    tau, sums = gathered(field, [octree], o, d, far, jitter, types.Float(0.6), types.Bool(True))
+    whole = np.array(optical_depth(field, o, d, types.Float(0), far, jitter, types.Bool(True)))
+    np.testing.assert_allclose(np.minimum(np.array(tau), 15), np.minimum(whole, 15), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(np.array(sums[0][0]), -np.expm1(-whole), rtol=1e-4, atol=1e-6)
+
+
+def test_collisions_lie_in_equal_shares_of_what_is_hidden() -> None:
+    field, origin, direction = _ball()
+    o, d, far, jitter = _upload(origin), _upload(direction), types.Float(math.inf), types.Float(0.5)
+    whole = np.array(optical_depth(field, o, d, types.Float(0), far, jitter, types.Bool(True)), np.float64)
+    hidden, count, shift = -np.expm1(-whole), 5, 0.25
+    found = np.array(depths(field, o, d, far, jitter, types.Float(hidden.astype(np.float32)), types.Float(shift), count, types.Bool(True)))
+    found = found.reshape(-1, count)
+    for k in range(count):
+        end = types.Float(np.ascontiguousarray(found[:, k]))
+        before = np.array(optical_depth(field, o, d, types.Float(0), end, jitter, types.Bool(True)), np.float64)
+        # The two marches take other steps, so that they agree only as well as a march does.
+        expected = (k + shift) / count * hidden
+        np.testing.assert_allclose(-np.expm1(-before)[hidden > 0.1], expected[hidden > 0.1], atol=0.02)
+    assert np.all(np.diff(found[hidden > 0.1], axis=1) > 0)
+
+
+def test_harmonics_keep_what_varies_slowly() -> None:
+    rng = np.random.default_rng(9)
+    coefficients = rng.normal(size=(9, 2))
+
+    def function(w: NDArray[np.float64]) -> NDArray[np.float64]:
+        result: NDArray[np.float64] = np.stack(harmonics(*w.T), axis=1) @ coefficients
+        return result
+
+    fitted = fit(function(spread(DIRECTIONS))[:, None, :]).reshape(2, 9)
+    np.testing.assert_allclose(fitted, coefficients.T, atol=1e-5)
+
+
+def test_a_cut_sky_is_covered_once_by_parts_of_about_one_weight() -> None:
+    rng = np.random.default_rng(10)
+    weight = rng.random((32, 64)) ** 4
+    weight[5, 9] = weight.sum()
+    edges = np.cos(np.linspace(0, np.pi, 33))
+    solid = np.broadcast_to((edges[:-1] - edges[1:])[:, None] * (2 * np.pi / 64), weight.shape)
+    parts = median_cut(weight, solid, 40)
+    cover = np.zeros(weight.shape, int)
+    for top, bottom, left, right in parts:
+        cover[top:bottom, left:right] += 1
+    assert np.all(cover == 1)
+    assert len(parts) == 40
+    # The bright cell stands alone, the rest is shared out.
+    assert (5, 6, 9, 10) in parts
+    others = [weight[t:b, a:z].sum() for t, b, a, z in parts if (t, b, a, z) != (5, 6, 9, 10)]
+    assert max(others) < 4 * np.mean(others)
