@@ -4,7 +4,7 @@
 
 A folder of scenes holds `<name>/scene.xml` (parameters integrator and size), `ref_a.exr` and `ref_b.exr`. Each method runs in a process
 of its own, one after the other. Writes `bench.csv`, a plot of time against error a scene and `bench.md`; the last lines printed are the
-speed-up of deepclouds at equal error, scene by scene.
+speed-up of deepclouds at equal error, scene by scene, and the medians of the scenes under suns alone and of those under an environment.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -31,7 +32,13 @@ from deepclouds.replacing import replacing
 
 ROOT = Path(__file__).resolve().parent.parent
 _MARKS = ("<!-- results: written by `python -m benchmarks.bench --docs` -->", "<!-- end of results -->")
-_LABELS = {"deepclouds": "deepclouds", "volpath": "volpath", "oidn": "volpath + OIDN", "single": "single scattering"}
+_LABELS = {
+    "deepclouds": "deepclouds",
+    "reference": "deepclouds, every sample asks",
+    "volpath": "volpath",
+    "oidn": "volpath + OIDN",
+    "single": "single scattering",
+}
 
 
 @dataclass(frozen=True)
@@ -60,8 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, help="pixels a side, a multiple of the references' size (default 96; with --quick that size)")
     parser.add_argument("--only", help="comma-separated names of scenes")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated, out of %(default)s")
-    parser.add_argument("--spp", help="spp of the peers (default 16,64,256; with --quick 4,16)")
-    parser.add_argument("--ours", help="spp of deepclouds, 0 for its own choice (default 0,4,16,64; with --quick 0)")
+    parser.add_argument(
+        "--spp", help="spp of the peers at the references' size, fewer for more pixels (default 16,64,256; with --quick 4,16)"
+    )
+    parser.add_argument("--ours", help="spp of deepclouds, 0 for its own choice (default 0,1,4,16; with --quick 0)")
     parser.add_argument("--model", help="another model for deepclouds than the released one")
     parser.add_argument("--seed", type=int, default=7, help="first seed (default %(default)s); share none with the references")
     parser.add_argument("--out", type=Path, default=Path("out/bench"), help="folder for images, table and plots (default %(default)s)")
@@ -77,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "oidn" in methods and "volpath" in methods:
         methods.remove("volpath")
     peers = _spp_list("--spp", options.spp or ("4,16" if options.quick else "16,64,256"), least=1)
-    ours = _spp_list("--ours", options.ours or ("0" if options.quick else "0,4,16,64"), least=0)
+    ours = _spp_list("--ours", options.ours or ("0" if options.quick else "0,1,4,16"), least=0)
 
     print(machine())
     rows: list[Row] = []
@@ -90,7 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise InputError(f"--size {size} is not a multiple of the references of {scene.name}, {side} x {side}")
         for method in methods:
             folder = options.out / scene.name
-            spps = ours if method == "deepclouds" else peers
+            # As many samples in all, whatever the number of pixels that they are spread over.
+            spps = ours if method == "deepclouds" else sorted({max(1, spp * side**2 // size**2) for spp in peers})
             problem = run_worker(method, scene / "scene.xml", size, spps, options.seed, folder, options.model)
             if problem is not None:
                 failures.append(f"{scene.name}: {_LABELS[method]} did not run: {problem}")
@@ -108,7 +118,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.docs:
         write_docs(rows, table)
     print(f"wrote {options.out}/bench.csv, bench.md" + (f" and {plotted} plots" if plotted else "; no plots: matplotlib is missing"))
-    for line in [*failures, *speed_ups(rows)]:
+    kinds = {scene.name: light_of(scene / "scene.xml") for scene in scenes}
+    for line in [*failures, *speed_ups(rows), medians(rows, kinds)]:
         print(line)
     return 1 if failures else 0
 
@@ -203,6 +214,36 @@ def speed_ups(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def light_of(scene: Path) -> str:
+    """What lights a scene file: "environment", or "sun" where there is none."""
+    kinds = {emitter.get("type") for emitter in ElementTree.parse(scene).getroot().iter("emitter")}
+    return "environment" if kinds & {"envmap", "constant"} else "sun"
+
+
+def medians(rows: Sequence[Row], kinds: Mapping[str, str]) -> str:
+    """Medians over scenes of the speed-up at equal error, under suns alone and under an environment."""
+
+    def median(kind: str, method: str) -> str:
+        ratios = []
+        for scene in (s for s in dict.fromkeys(r.scene for r in rows) if kinds[s] == kind):
+            candidates = [r for r in rows if (r.scene, r.method) == (scene, "deepclouds")]
+            if not candidates:
+                continue
+            ours = next((r for r in candidates if r.spp == DEFAULT_SPP), max(candidates, key=lambda r: r.spp))
+            needed = equal_error(rows, ours).get(method)
+            if needed is not None:
+                ratios.append(needed.over(ours.seconds_warm))
+        if not ratios:
+            return "unknown"
+        ratios.sort(key=lambda r: r.value)
+        low, high = ratios[(len(ratios) - 1) // 2], ratios[len(ratios) // 2]
+        bounds = {b for b in (low.bound, high.bound) if b}
+        return str(Bounded(0.5 * (low.value + high.value), bounds.pop() if len(bounds) == 1 else ""))
+
+    sun = f"sun {median('sun', 'volpath')} x volpath, {median('sun', 'oidn')} x volpath+OIDN"
+    return f"speed: {sun}; environment {median('environment', 'volpath')} x volpath"
+
+
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write one line an image; fractions, not per cent; an empty field is a figure that was not measured."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -230,7 +271,7 @@ def markdown(rows: Sequence[Row]) -> str:
         r = row.report
         interval = f"{100 * r.rrmse:.2f} [{100 * r.rrmse_interval[0]:.2f}, {100 * r.rrmse_interval[1]:.2f}]"
         energy = f"{100 * r.energy:+.2f} [{100 * r.energy_interval[0]:+.2f}, {100 * r.energy_interval[1]:+.2f}]"
-        peers = equal_error(rows, row) if row.method == "deepclouds" else {}
+        peers = equal_error(rows, row) if row.method in ("deepclouds", "reference") else {}
         needed = [f"{peers[m]} s ({peers[m].over(row.seconds_warm)} x)" if m in peers else "" for m in ("volpath", "oidn")]
         cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.3g}"
         flip = "" if r.flip is None else f"{r.flip:.4f}"
@@ -258,7 +299,13 @@ def write_plots(folder: Path, rows: Sequence[Row]) -> int:
 
     scenes = list(dict.fromkeys(r.scene for r in rows))
     folder.mkdir(parents=True, exist_ok=True)
-    styles = {"deepclouds": ("#b3122a", "o"), "volpath": ("#444444", "s"), "oidn": ("#2a55a8", "^"), "single": ("#b08a2e", "x")}
+    styles = {
+        "deepclouds": ("#b3122a", "o"),
+        "reference": ("#d98a94", "D"),
+        "volpath": ("#444444", "s"),
+        "oidn": ("#2a55a8", "^"),
+        "single": ("#b08a2e", "x"),
+    }
     for scene in scenes:
         figure = Figure(figsize=(5.2, 3.9), dpi=130, layout="constrained")
         FigureCanvasAgg(figure)
