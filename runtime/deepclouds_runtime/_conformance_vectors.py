@@ -85,12 +85,13 @@ def _media(volume: Volume) -> tuple[Medium, ...]:
 
 
 def _queries(rng: np.random.Generator, volume: Volume, medium: Medium) -> NDArray[np.float64]:
-    """Rows of `Vectors.queries` (count, 14): half close to a view along the sun, points in the box and beside it."""
+    """Rows of `Vectors.queries` (count, 14): two points of three in the cloud, the others around it; half of the views along the sun."""
     n = medium.count
     accepted: list[NDArray[np.float64]] = []
     while len(accepted) < n:
-        unit_point = rng.uniform(-0.12, 1.12, 3)
-        point = volume.to_world[:3, :3] @ unit_point + volume.to_world[:3, 3]
+        point = volume.to_world[:3, :3] @ rng.uniform(-0.12, 1.12, 3) + volume.to_world[:3, 3]
+        if len(accepted) % 3 != 0 and volume.sample(point[None])[0] == 0:
+            continue
         sun = _direction(rng)
         if rng.random() < 0.5:
             w = _direction(rng)
