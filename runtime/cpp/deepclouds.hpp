@@ -134,12 +134,10 @@ struct Lattice {
 class Descriptor {
  public:
   // Unit of length and cell origin as the contract defines them.
-  Descriptor(const Grid& grid, double scale) : Descriptor(grid, scale, 0, nullptr) {}
+  Descriptor(const Grid& grid, double scale) : Descriptor(grid, scale, Frame{}) {}
 
   // Those of another frame: keep them fixed for a sequence, so that nothing flickers when the cloud changes.
-  Descriptor(const Grid& grid, double scale, double unit, Vec3 origin) : Descriptor(grid, scale, unit, &origin) {
-    if (!(std::isfinite(unit) && unit > 0)) throw std::invalid_argument("deepclouds: the unit of length must be positive and finite");
-  }
+  Descriptor(const Grid& grid, double scale, double unit, Vec3 origin) : Descriptor(grid, scale, Frame{true, unit, origin}) {}
 
   double unit() const { return unit_; }        // mean free path at the extinction-weighted mean extinction, world units
   Vec3 origin() const { return origin_; }      // on a corner of the cells of every filtered level
@@ -199,28 +197,38 @@ class Descriptor {
   }
 
  private:
-  Descriptor(const Grid& grid, double scale, double unit, const Vec3* origin) : box_(grid.box), scale_(scale) {
-    if (!(std::isfinite(scale) && scale >= 0)) throw std::invalid_argument("deepclouds: the extinction's scale must be finite and not negative");
+  struct Frame {
+    bool given = false;
+    double unit = 1;
+    Vec3 origin;
+  };
+
+  Descriptor(const Grid& grid, double scale, const Frame& frame) : box_(grid.box), scale_(scale) {
+    require(std::isfinite(frame.unit) && frame.unit > 0, "deepclouds: the unit of length must be positive and finite");
+    require(std::isfinite(scale) && scale >= 0, "deepclouds: the extinction's scale must be finite and not negative");
     for (int a = 0; a < 3; ++a) {
-      if (grid.resolution[a] < 1) throw std::invalid_argument("deepclouds: a grid needs a sample along each axis");
+      require(grid.resolution[a] >= 1, "deepclouds: a grid needs a sample along each axis");
       length_[a] = norm(box_.edges[a]);
-      if (!(length_[a] > 0)) throw std::invalid_argument("deepclouds: the grid's box has no volume");
+      require(length_[a] > 0, "deepclouds: the grid's box has no volume");
       axes_[a] = (1 / length_[a]) * box_.edges[a];
     }
     for (int a = 0; a < 3; ++a) {
-      if (std::abs(dot(axes_[a], axes_[(a + 1) % 3])) > 1e-4) {
-        throw std::invalid_argument("deepclouds: the grid's axes are not perpendicular; resample the sheared volume to a box first");
-      }
+      const bool perpendicular = std::abs(dot(axes_[a], axes_[(a + 1) % 3])) < 1e-4;
+      require(perpendicular, "deepclouds: the grid's axes are not perpendicular; resample the sheared volume to a box first");
     }
     voxel_ = std::min({length_[0] / grid.resolution[0], length_[1] / grid.resolution[1], length_[2] / grid.resolution[2]});
     read(grid);
     double mass = 0, square = 0;
     const Vec3 centre = centre_of_mass(mass, square);
-    origin_ = origin ? *origin : centre;
     const double mean = mass > 0 ? scale_ * square / mass : 0;
-    unit_ = unit > 0 ? unit : mean > 0 ? 1 / mean : 1;
+    origin_ = frame.given ? frame.origin : centre;
+    unit_ = frame.given ? frame.unit : mean > 0 ? 1 / mean : 1;
     while (raw_ < levels && spacing_of(raw_) <= voxel_) ++raw_;
     filter();
+  }
+
+  static void require(bool holds, const char* message) {
+    if (!holds) throw std::invalid_argument(message);
   }
 
   double spacing_of(int level) const { return first_spacing * std::ldexp(unit_, level); }
@@ -233,7 +241,7 @@ class Descriptor {
       for (int j = 0; j < ny; ++j) {
         for (int i = 0; i < nx; ++i) {
           const double value = grid.density(i, j, k);
-          if (!(std::isfinite(value) && value >= 0)) throw std::invalid_argument("deepclouds: densities must be finite and not negative");
+          require(std::isfinite(value) && value >= 0, "deepclouds: densities must be finite and not negative");
           field_.values.push_back(static_cast<float>(value));
         }
       }

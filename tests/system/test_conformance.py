@@ -217,15 +217,19 @@ def test_other_vectors_are_refused(copy_of_a_model: Path, vectors: Vectors, tmp_
         main([str(copy_of_a_model), "--vectors", str(other)])
 
 
-@pytest.fixture(scope="module")
-def cpp(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The C++ example, compiled without a warning."""
-    program = tmp_path_factory.mktemp("cpp") / "verify"
-    source = root / "runtime" / "cpp" / "verify.cpp"
-    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Werror"]
-    done = subprocess.run(["g++", *flags, str(source), "-o", str(program)], capture_output=True, text=True, check=False, timeout=300)
+def compiled(root: Path, source: Path, program: Path, *flags: str) -> Path:
+    """A program that includes the header, compiled without a warning."""
+    warnings = ["-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Werror"]
+    command = ["g++", "-std=c++17", *flags, *warnings, f"-I{root / 'runtime' / 'cpp'}", str(source), "-o", str(program)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     return program
+
+
+@pytest.fixture(scope="module")
+def cpp(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The C++ example."""
+    return compiled(root, root / "runtime" / "cpp" / "verify.cpp", tmp_path_factory.mktemp("cpp") / "verify", "-O2")
 
 
 def run(program: Path, file: Path) -> subprocess.CompletedProcess[str]:
@@ -265,10 +269,8 @@ def test_the_program_of_the_documentation_compiles_and_runs(root: Path, tmp_path
     text = (root / "docs" / "renderer_authors.md").read_text()
     source = tmp_path / "example.cpp"
     source.write_text(text.partition("```cpp\n")[2].partition("```")[0])
-    include = f"-I{root / 'runtime' / 'cpp'}"
-    flags = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", include]
-    subprocess.run(["g++", *flags, str(source), "-o", str(tmp_path / "example")], check=True, timeout=300)
-    line = subprocess.run([str(tmp_path / "example")], capture_output=True, text=True, check=True, timeout=60).stdout
+    program = compiled(root, source, tmp_path / "example", "-O1")
+    line = subprocess.run([str(program)], capture_output=True, text=True, check=True, timeout=60).stdout
     unit, raw, value, tau = (float(found) for found in re.findall(r"-?\d+\.?\d*", line))
 
     centres = (np.arange(32) + 0.5) / 32 * 2 - 1
@@ -289,3 +291,75 @@ def test_the_cpp_program_refuses_a_damaged_file(cpp: Path, tmp_path: Path) -> No
     cut.write_bytes(VECTORS.read_bytes()[:5000])
     assert run(cpp, cut).returncode == 2
     assert run(cpp, tmp_path / "absent.bin").returncode == 2
+
+
+EDGES = r"""
+#include "deepclouds.hpp"
+#include <cstdio>
+using namespace deepclouds;
+
+double density(int i, int j, int k) { return 0.1 + 0.2 * i + 0.3 * j + 0.05 * k * k; }
+
+template <class F>
+void refuses(F make) {
+  try {
+    make();
+    std::puts("accepted");
+  } catch (const std::invalid_argument& error) {
+    std::puts(error.what());
+  }
+}
+
+int main() {
+  const Box box{{-1, 0, 2}, {{{1, 0, 0}, {0, 3, 0}, {0, 0, 2}}}};
+  const Grid grid{{1, 3, 4}, box, density};
+  const Vec3 point{-0.6, 1.4, 3.1}, sun{0.48, 0.6, 0.64}, w{0, -0.6, 0.8};
+  float s[stencil_size];
+  const auto print = [&] {
+    for (float v : s) std::printf("%.9g ", v);
+    std::puts("");
+  };
+  const Descriptor cloud(grid, 2.0);
+  cloud.stencil(point, w, sun, s);
+  print();
+  cloud.stencil(point, w, sun, s, 0.0, true);
+  print();
+  cloud.stencil(point, -1.0 * sun, sun, s, 0.7);
+  print();
+  Descriptor(grid, 0.0).stencil(point, w, sun, s);
+  print();
+  std::printf("%.9g %.9g\n", cloud.sigma_t(point), cloud.sigma_t({5, 5, 5}));
+  refuses([&] { Descriptor(Grid{{1, 3, 4}, box, [](int, int, int) { return -1.0; }}, 1.0); });
+  refuses([&] { Descriptor(Grid{{1, 3, 4}, {{}, {{{1, 0, 0}, {1, 3, 0}, {0, 0, 2}}}}, density}, 1.0); });
+  refuses([&] { Descriptor(Grid{{1, 3, 4}, {{}, {{{1, 0, 0}, {0, 0, 0}, {0, 0, 2}}}}, density}, 1.0); });
+  refuses([&] { Descriptor(Grid{{0, 3, 4}, box, density}, 1.0); });
+  refuses([&] { Descriptor(grid, -1.0); });
+  refuses([&] { Descriptor(grid, 1.0, 0.0, {}); });
+}
+"""
+
+
+def test_the_cpp_header_at_its_edges(root: Path, tmp_path: Path) -> None:
+    """What the vectors leave out: one sample along an axis, the mirror image, parallel view and light, no extinction, bad input."""
+    source = tmp_path / "edges.cpp"
+    source.write_text(EDGES)
+    program = compiled(root, source, tmp_path / "edges", "-O1")
+    lines = subprocess.run([str(program)], capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()
+    plain, mirrored, parallel, empty = (np.array(line.split(), float).reshape(10, 225) for line in lines[:4])
+
+    k, j, i = np.meshgrid(np.arange(4), np.arange(3), np.arange(1), indexing="ij")
+    volume = Volume.from_box(0.1 + 0.2 * i + 0.3 * j + 0.05 * k * k, (-1, 0, 2), (0, 3, 4))
+    descriptor = Descriptor(Field(backend("llvm"), volume, 2.0))
+    point, sun, w = np.array([[-0.6, 1.4, 3.1]]), np.array([[0.48, 0.6, 0.64]]), np.array([[0, -0.6, 0.8]])
+    np.testing.assert_allclose(plain, descriptor.stencils_numpy(point, w, sun)[0], atol=1e-4)
+    np.testing.assert_allclose(mirrored, descriptor.stencils_numpy(point, w, sun, side=[-1.0])[0], atol=1e-4)
+    np.testing.assert_allclose(parallel, descriptor.stencils_numpy(point, -sun, sun, azimuth=[0.7])[0], atol=1e-4)
+    assert np.abs(plain - mirrored).max() > 0.1
+    assert not empty.any()
+    inside, outside = map(float, lines[4].split())
+    assert inside == pytest.approx(2 * volume.sample(point)[0], rel=1e-6)
+    assert outside == 0
+    words = ["not negative", "perpendicular", "no volume", "a sample along", "scale must be", "unit of length"]
+    assert len(lines) == 5 + len(words)
+    for line, expected in zip(lines[5:], words, strict=True):
+        assert expected in line
