@@ -60,7 +60,7 @@ class AllRound:
 
     def __init__(self, cloud: Cloud, lights: Sequence[Arriving], seen: Seen, root: float, tolerance: float, budget: int) -> None:
         self.source: FrameSource | None = frame_source(
-            cloud, lights, [Direction(w) for w in spread(DIRECTIONS)], seen, root, tolerance, budget, fit
+            cloud, lights, [Direction(w) for w in spread(DIRECTIONS)], seen, root, tolerance, budget, fit, _HARMONICS
         )
         self._channels, self._types = len(cloud.albedo), cloud.field.types
         self.queries = 0 if self.source is None else self.source.queries

@@ -175,6 +175,7 @@ def frame_source(
     tolerance: float,
     budget: int,
     combine: Callable[[Array], Array] = operator.itemgetter(0),
+    every: int = 1,
 ) -> FrameSource | None:
     """J of a frame; None where it is 0 everywhere.
 
@@ -194,6 +195,8 @@ def frame_source(
         see `Octree`; `budget` counts queries.
     combine
         makes the fields (n, l) that are interpolated of the values (eyes, n, k).
+    every
+        of so many fields the first is a value of J; the others may have any sign.
     """
     network = cloud.scattering
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
@@ -211,7 +214,7 @@ def frame_source(
     held_out, built_for = _split(seen, checks)
     octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS)
     device = octree.upload(field.types)
-    factor, error = _audit(device, predicted, held_out)
+    factor, error = _audit(device, predicted, held_out, every)
     return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights))
 
 
@@ -295,7 +298,7 @@ def _split(seen: Seen, count: int) -> tuple[Seen, Seen]:
     return Seen(seen.points[chosen], np.ones(count)), Seen(seen.points[rest], seen.weights[rest])
 
 
-def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: Seen) -> tuple[float, float]:
+def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: Seen, every: int) -> tuple[float, float]:
     """Compare interpolated with true values at points that the camera sees.
 
     A cloud is bright where it is dense, and nodes lie anywhere: interpolation is a little too dark. Returns the factor that makes up for it
@@ -303,10 +306,10 @@ def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: See
     """
     if not len(checks.points):
         return 1.0, 0.0
-    true = evaluate(checks.points).astype(np.float64)
+    true = evaluate(checks.points).astype(np.float64)[:, ::every]
     values = octree.lookup(octree.to_local(_upload(octree.types, checks.points)), octree.types.Bool(True))
     dr.eval(values)
-    interpolated = np.stack([np.array(v, np.float64) for v in values], axis=1)
+    interpolated = np.stack([np.array(v, np.float64) for v in values[::every]], axis=1)
     if not (true.sum() > 0 and interpolated.sum() > 0):
         return 1.0, 0.0
     factor = float(true.sum() / interpolated.sum())

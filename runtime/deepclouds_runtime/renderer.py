@@ -333,7 +333,7 @@ class _Work:
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
             for source, _ in self.on_surfaces.sources:
                 lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, 2 * tolerance, _BUDGET)
+            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, 2 * tolerance, _BUDGET // 4)
             self.counts.queries += self.all_round.queries
         self.spent("light on surfaces", clock)
 
