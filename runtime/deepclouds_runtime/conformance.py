@@ -296,6 +296,8 @@ def main(argv: Sequence[str]) -> int:
         "--stencils", metavar="FILE", type=Path, help="make the vectors anew first; every model's outputs are then out of date"
     )
     options = parser.parse_args(argv)
+    if options.model is None and options.stencils is None:
+        parser.error("nothing to make: name a MODEL, or --stencils FILE")
     if options.stencils is not None:
         write_vectors(options.stencils, make_vectors())
         print(f"wrote {options.stencils}")

@@ -107,6 +107,12 @@ def without_the_cut(vectors: Vectors) -> Vectors:
     return replace(vectors, volume=Volume(np.pad(volume.density, n, mode="edge"), to_world))
 
 
+def without_the_unit(vectors: Vectors) -> NDArray[np.float32]:
+    units = np.concatenate([np.full(m.count, m.unit, np.float32) for m in vectors.media])
+    bare: NDArray[np.float32] = stencils_of(vectors) / units[:, None, None]
+    return bare
+
+
 MISTAKES: dict[str, Callable[[Vectors], NDArray[np.float32]]] = {
     "x mirrored": lambda v: stencils_of(v, side=-1.0),
     "omega_sun in the direction of the light": lambda v: stencils_of(v, sun=-1.0),
@@ -115,9 +121,7 @@ MISTAKES: dict[str, Callable[[Vectors], NDArray[np.float32]]] = {
     "half a voxel": lambda v: stencils_of(elsewhere(v, 0.5)),
     "a hundredth of a voxel": lambda v: stencils_of(elsewhere(v, 0.01)),
     "not zero outside": lambda v: stencils_of(without_the_cut(v)),
-    "extinction in place of extinction times unit": lambda v: (
-        stencils_of(v) / np.repeat([m.unit for m in v.media], [m.count for m in v.media])[:, None, None].astype(np.float32)
-    ),
+    "extinction in place of extinction times unit": without_the_unit,
     "z fastest": lambda v: np.ascontiguousarray(np.swapaxes(stencils_of(v).reshape(-1, 10, 9, 25), 2, 3)).reshape(-1, 10, 225),
     "coarsest level first": lambda v: np.ascontiguousarray(stencils_of(v)[:, ::-1]),
 }
