@@ -225,7 +225,7 @@ def _phase_words(phase: tuple[float, float, float]) -> str:
 
 def _report(result: RenderResult, say: Callable[[str], None]) -> None:
     statistics = result.statistics
-    rows = [("mode", statistics.mode), ("samples a pixel", f"{statistics.spp:,}")]
+    rows = [("mode", statistics.mode), ("samples a pixel", f"up to {statistics.spp:,}, on average {statistics.mean_spp:.3g}")]
     if statistics.noise is not None:
         rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
     for name, source in statistics.sources.items():

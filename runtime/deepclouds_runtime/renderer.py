@@ -43,6 +43,10 @@ ERROR = 0.02
 _DARK = 0.02
 # Error of the interpolation at a point over the noise of a pixel, both aimed at: along rays and between pixels that of points averages out.
 _INTERPOLATION = 2.5
+# Side of the blocks of pixels that rest together, and the share of the noise asked for that resting blocks may have.
+_BLOCK, _REST = 8, 0.5
+# The variance of well spread samples falls a little faster than with their number: the power of the number that it asks for.
+_CONVERGENCE = 0.75
 # Rays that look for what the camera sees, and collisions on each of them.
 _PILOT, _PILOT_DEPTHS = 1 << 16, 4
 # Most queries for the suns, and as many for the light from all around.
@@ -69,7 +73,9 @@ class Statistics:
     mode
         ``"fast"`` or ``"reference"``.
     spp
-        samples a pixel.
+        samples of the pixels that took most of them.
+    mean_spp
+        samples a pixel, on average.
     noise
         estimated noise of a pixel, root of the mean square over the mean, where the image is not dark; None where one round was asked for.
     sources
@@ -81,6 +87,7 @@ class Statistics:
 
     mode: str
     spp: int = 0
+    mean_spp: float = 0.0
     noise: float | None = None
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
@@ -238,16 +245,20 @@ class Renderer:
         else:
             asked = int(scene.sensor.sampler().sample_count())
             _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
+            growth = 2.0
+            work.round(0, 1, most, None)
             while work.samples < most and not noise <= error:
                 before, done = work.beauty(), work.samples
-                size = 1 if done < 2 else math.ceil(done * (min(noise / error, 4.0) ** 1.5 - 1))
-                work.round(done, min(size, most - done), most, progress)
-                if done:
-                    noise = _noise(before, work.beauty()) * math.sqrt(done / (work.samples - done))
+                work.round(done, min(math.ceil(done * (growth - 1)), most - done), most, None)
+                noise, growth = work.settle(before, done, error)
+                if progress is not None:
+                    progress(min(error / max(noise, 1e-9), 1.0) ** 2)
         channels = work.image()
         seconds = {"load": self._load_seconds, **work.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
-        statistics = Statistics("fast" if fast else "reference", work.samples, noise if math.isfinite(noise) else None)
+        statistics = Statistics(
+            "fast" if fast else "reference", work.samples, float(work.taken.mean()), noise if math.isfinite(noise) else None
+        )
         for name, source in (*work.named.items(), ("light on surfaces", None if work.all_round is None else work.all_round.source)):
             if source is not None:
                 statistics.sources[name] = source.summary()
@@ -280,6 +291,14 @@ class _Work:
     sums: dict[str, Image] = field(default_factory=dict)
     samples: int = 0
     sources: list[FrameSource] | None = None
+
+    def __post_init__(self) -> None:
+        width, height = self.scene.size
+        # Pixels that still take samples, how many each has taken, and the estimated variance of its mean.
+        self._active = np.arange(width * height, dtype=np.uint32)
+        self.taken = np.zeros(width * height, np.float32)
+        self._variance = np.zeros((width * height, 3), np.float64)
+
     named: dict[str, FrameSource] = field(default_factory=dict)
     all_round: AllRound | None = None
 
@@ -375,32 +394,74 @@ class _Work:
 
     def round(self, first: int, samples: int, most: int, progress: Callable[[float], None] | None) -> None:
         """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all."""
-        width, height = self.scene.size
-        total = width * height
+        total = len(self._active)
         pixels = max(1, _PASS // samples)
         for start in range(0, total, pixels):
-            count = min(pixels, total - start)
-            self.add(start, count, first, samples, most)
+            self.add(self._active[start : start + pixels], first, samples, most)
             if progress is not None:
-                progress((first + samples * (start + count) / total) / most)
+                progress((first + samples * min(start + pixels, total) / total) / most)
+        self.taken[self._active] += samples
         self.samples += samples
+
+    def settle(self, before: Image, done: int, error: float) -> tuple[float, float]:
+        """Estimate the noise, and let blocks of pixels rest that add little to it.
+
+        Parameters
+        ----------
+        before, done
+            the image before the last round, and how many samples its pixels had taken.
+        error
+            noise to aim at, over the mean.
+
+        Returns
+        -------
+        The noise of the whole image over the mean, and by how much the number of samples of the remaining pixels should grow.
+        """
+        width, height = self.scene.size
+        after, active = self.beauty(), self._active
+        # Of a mean of which the last part is independent of the first.
+        change = (after[active] - before[active]).astype(np.float64)
+        self._variance[active] = np.square(change) * (done / (self.samples - done))
+        lit = after > _DARK * np.quantile(after, 0.999)
+        if not lit.any():
+            return 0.0, 1.0
+        allowed = (error * float(after[lit].mean(dtype=np.float64))) ** 2 * np.count_nonzero(lit)
+        noise = error * math.sqrt(float(self._variance[lit].sum()) / allowed) if allowed > 0 else 0.0
+        # A pixel's own estimate has two numbers behind it, a block's has many.
+        index = np.arange(width * height)
+        columns = -(-width // _BLOCK)
+        block = index // width // _BLOCK * columns + index % width // _BLOCK
+        of_block = np.bincount(block, np.where(lit, self._variance, 0).sum(axis=1))
+        awake = np.zeros(len(of_block), bool)
+        awake[block[active]] = True
+        resting = float(of_block[~awake].sum())
+        order = np.flatnonzero(awake)[np.argsort(of_block[awake])]
+        sleepy = order[resting + np.cumsum(of_block[order]) <= _REST * allowed]
+        # What never stays awake cannot bring the noise down.
+        if len(sleepy) < len(order):
+            awake[sleepy] = False
+            resting += float(of_block[sleepy].sum())
+            self._active = active[awake[block[active]]]
+        moving = float(of_block[awake].sum())
+        growth = (moving / max(allowed - resting, 1e-30)) ** _CONVERGENCE
+        return noise, float(np.clip(growth, 1.0 + 0.5 / self.samples, 4.0))
 
     def _seed(self) -> Any:
         return dr.opaque(self.types.UInt32, self.seed & 0xFFFFFFFF)
 
-    def add(self, first: int, pixels: int, sample: int, samples: int, most: int) -> None:
-        """Render `pixels` pixels from number `first` on, `samples` samples each from number `sample` of `most` on."""
+    def add(self, pixels: NDArray[np.uint32], sample: int, samples: int, most: int) -> None:
+        """Render the pixels of these numbers, `samples` samples each from number `sample` of `most` on."""
         types, scene = self.types, self.scene
-        n = pixels * samples
+        n = len(pixels) * samples
         self.counts.camera_samples += n
         count = dr.opaque(types.UInt32, samples)
         index = dr.arange(types.UInt32, n)
         local = index // count
-        pixel = local + dr.opaque(types.UInt32, first)
+        pixel = dr.gather(types.UInt32, types.UInt32(pixels), local)
         numbers = Stratified(
             types, pixel, index - local * count + dr.opaque(types.UInt32, sample), dr.opaque(types.UInt32, most), self._seed()
         )
-        where = slice(first, first + pixels), samples
+        where = pixels, samples
         origin, direction, end = self.camera.rays(pixel, numbers)
         interaction: Any = None
         shown: Any = None
@@ -448,7 +509,7 @@ class _Work:
         shown = plain(types, interaction.is_valid())
         return interaction, dr.select(shown, plain(types, interaction.t), end), shown
 
-    def _collect(self, where: tuple[slice, int], name: str, values: list[Any]) -> None:
+    def _collect(self, where: tuple[NDArray[np.uint32], int], name: str, values: list[Any]) -> None:
         """Add the samples of each pixel to what is kept under `name`."""
         pixels, n = where
         # Together, or each channel would trace its own rays again.
@@ -468,13 +529,14 @@ class _Work:
         total = np.zeros((width * height, 3), np.float32)
         for layer in LAYERS:
             if layer in self.sums:
-                total += self.sums[layer] * np.float32(1 / self.samples)
+                total += self.sums[layer]
+        total /= np.maximum(self.taken, 1)[:, None]
         return total
 
     def image(self) -> dict[str, Image]:
         """All channels (h, w) of the finished image."""
         width, height = self.scene.size
-        means = {name: values * np.float32(1 / self.samples) for name, values in self.sums.items()}
+        means = {name: values / self.taken[:, None] for name, values in self.sums.items()}
         channels: dict[str, Image] = {}
         for layer in LAYERS:
             values = np.broadcast_to(means.get(layer, np.zeros((width * height, 3), np.float32)), (width * height, 3))
@@ -487,12 +549,3 @@ class _Work:
         channels["volume_opacity"] = opacity
         channels["volume_Z"] = np.where(opacity > 0, depth / np.where(opacity > 0, opacity, 1), 0).astype(np.float32)
         return channels
-
-
-def _noise(a: Image, b: Image) -> float:
-    """Root of the mean squared difference of two images (pixels, channels) over their mean, where they are not dark."""
-    mean = 0.5 * (a + b).astype(np.float64)
-    lit = mean > _DARK * np.quantile(mean, 0.999)
-    if not lit.any():
-        return 0.0
-    return float(np.sqrt(np.mean(np.square(a - b)[lit], dtype=np.float64)) / mean[lit].mean())
