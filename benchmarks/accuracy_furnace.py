@@ -51,7 +51,7 @@ class FurnaceCloud:
     @property
     def rms(self) -> float:
         """Root mean square deviation of the tiles from 1, free of noise."""
-        return float(np.sqrt(max(0.0, np.mean((self.tiles[:, 0] - 1) * (self.tiles[:, 1] - 1)))))
+        return float(np.sqrt(max(0.0, float(np.mean((self.tiles[:, 0] - 1) * (self.tiles[:, 1] - 1))))))
 
 
 def plan(clouds: int) -> list[tuple[str, int, float, float]]:
@@ -97,7 +97,8 @@ def tile_means(images: list[Floats], counts: NDArray[np.bool_]) -> Floats:
 
     def sums(values: Floats) -> Floats:
         h, w = values.shape[0] // _TILE, values.shape[1] // _TILE
-        return values.reshape(h, _TILE, w, _TILE).sum(axis=(1, 3)).ravel()
+        total: Floats = values.reshape(h, _TILE, w, _TILE).sum(axis=(1, 3)).ravel()
+        return total
 
     number = sums(counts.astype(np.float64))
     full = number >= _LEAST

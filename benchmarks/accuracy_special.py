@@ -84,20 +84,22 @@ def measure_case(case: Case, predictor: Predicts, points: int, walks: int, seed:
     hits, hit = first_collisions(field, origins, directions, streams[1])
     chosen = np.flatnonzero(hit & case.counts(hits))[:points]
     x, w = hits[chosen], directions[chosen]
-    suns = np.broadcast_to(case.omega_sun.astype(np.float32), (len(x), 1, 3))
-    halves = []
-    for stream in streams[2:]:
-        # Rows are points, many times over: so many walks of each are traced together.
-        portions = [min(max(1, _AT_ONCE // len(x)), walks // 2 - start) for start in range(0, walks // 2, max(1, _AT_ONCE // len(x)))]
-        sums = np.zeros(len(x))
-        for number, portion in enumerate(portions):
-            j = trace_walks(
-                field, x, w, np.full(len(x), case.g, np.float32), suns, np.ones((len(x), 1), np.float32), portion, stream + number
-            )
-            sums += j[:, :, 0, 0].sum(axis=1, dtype=np.float64)
-        halves.append(sums / (walks // 2))
+    half_a, half_b = (_walked(case, field, x, w, walks // 2, stream) for stream in streams[2:])
     j = predict(x, w, volume=case.volume, scale=case.scale, g=case.g, albedo=1.0, omega_sun=case.omega_sun, predictor=predictor)
-    return CaseResult(case.name, 4 * math.pi * j, *halves)
+    return CaseResult(case.name, 4 * math.pi * j, half_a, half_b)
+
+
+def _walked(case: Case, field: Field, x: Singles, w: Singles, walks: int, seed: int) -> Floats:
+    """Mean of so many walks of each point, a portion of them at a time."""
+    n = len(x)
+    g, white = np.full(n, case.g, np.float32), np.ones((n, 1), np.float32)
+    suns = np.broadcast_to(case.omega_sun.astype(np.float32), (n, 1, 3))
+    total = np.zeros(n)
+    portion = max(1, _AT_ONCE // n)
+    for number, first in enumerate(range(0, walks, portion)):
+        j = trace_walks(field, x, w, g, suns, white, min(portion, walks - first), seed + number)
+        total += j[:, :, 0, 0].sum(axis=1, dtype=np.float64)
+    return total / walks
 
 
 def _everywhere(points: Singles) -> NDArray[np.bool_]:
@@ -110,7 +112,8 @@ def _lines(volume: Volume, scale: float) -> Callable[[Generator, int], tuple[Sin
 
 
 def _direction(vector: list[float]) -> Floats:
-    return np.asarray(vector, np.float64) / np.linalg.norm(vector)
+    unit: Floats = np.asarray(vector, np.float64) / np.linalg.norm(vector)
+    return unit
 
 
 def _backlit_stratus() -> Case:
