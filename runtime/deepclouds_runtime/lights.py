@@ -282,7 +282,8 @@ def directions_of_cells(rows: int, columns: int, part: tuple[float, float]) -> N
 def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Luminance of colours (..., channels)."""
     weights = _LUMINANCE if colours.shape[-1] == 3 else (1.0,)
-    return np.asarray(colours, np.float64) @ np.array(weights)
+    result: NDArray[np.float64] = np.asarray(colours, np.float64) @ np.array(weights)
+    return result
 
 
 def on_host(values: list[Any], count: int) -> NDArray[np.float64]:

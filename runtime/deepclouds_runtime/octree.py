@@ -192,6 +192,7 @@ class Octree:
         """Values (m, 8, k) at the corners of cells (m, 3) of a level, asking for those that are not known yet."""
         corners = (coordinates[:, None] + _CORNERS) << (self._levels - level)
         keys = corners[..., 0] | corners[..., 1] << _BITS | corners[..., 2] << 2 * _BITS
+        unique: Array
         unique, inverse = np.unique(keys, return_inverse=True)
         place = np.searchsorted(self._keys, unique)
         found = np.zeros(len(unique), bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def _lattice(spacing: float) -> Lattice:
     return lattice_around(BOX, CORNER, TURN, spacing)
 
 
-def _upload(values: NDArray[np.float64]) -> types.Array3f:  # type: ignore[valid-type]
+def _upload(values: NDArray[np.float64]) -> Any:
     return types.Array3f(np.ascontiguousarray(values.T, np.float32))
 
 
@@ -50,7 +51,8 @@ def test_a_linear_function_is_met_exactly_wherever_it_is_asked() -> None:
     """Even where no point lay when the octree was built: in cells it never asked about it goes on from the neighbours' corners."""
 
     def linear(points: NDArray[np.float64]) -> NDArray[np.float32]:
-        return (points @ np.array([[1.0], [2.0], [-0.5]]) + 9).astype(np.float32)
+        result: NDArray[np.float32] = (points @ np.array([[1.0], [2.0], [-0.5]]) + 9).astype(np.float32)
+        return result
 
     points = _points(500, 1)
     octree = Octree(_lattice(0.3), linear, points, np.ones(len(points)), 1e-6, 10**6, 2)
