@@ -137,7 +137,7 @@ def test_walks_give_the_exact_flux() -> None:
 
 
 def test_the_exact_fluxes_are_those_of_the_published_table() -> None:
-    """Van de Hulst's values as agreed by adding-doubling to five digits."""
+    """Values that adding-doubling, another method, agrees with to five digits."""
     rows = [(1.0, 1.0, 0.0, 0.34133, 0.65867), (8.0, 1.0, 0.85, 0.35843, 0.64157), (1.0, 0.99, 0.0, 0.33292, 0.65098)]
     for tau, albedo, g, reflected, transmitted in rows:
         assert discrete_ordinates(Slab(tau, g, albedo, 1.0)) == pytest.approx((reflected, transmitted), abs=2e-5)
