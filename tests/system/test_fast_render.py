@@ -185,3 +185,15 @@ def test_modes_and_errors_that_make_no_sense_are_refused(folder: Path) -> None:
     for error in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="error ="):
             load(path, predictor=Smooth()).render(error=error)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"optical_depth": 0.0}, {"sun": (0, 30), "irradiance": 0.0, "sky": 0.0}, {"size": (1, 1)}, {"max_depth": 2}, {"albedo": 0.0}],
+    ids=["no cloud", "no light", "one pixel", "single scattering", "black cloud"],
+)
+def test_the_dial_ends_where_there_is_little_to_see(folder: Path, options: dict[str, Any]) -> None:
+    result = load(folder / "ball.vol", predictor=Smooth(), **{"size": (9, 7), **options}).render(error=0.05)
+    assert np.all(np.isfinite(result.rgb))
+    assert result.rgb.min() >= 0
+    assert 2 <= result.statistics.spp < 1024
