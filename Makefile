@@ -4,6 +4,8 @@
 PYTHON ?= python3
 SCENES ?=
 TESTS ?=
+MODEL ?=
+LABELS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -21,7 +23,7 @@ NATIVE := CMakeLists.txt $(wildcard deepclouds/volume/native/*)
 .NOTPARALLEL:
 .SILENT:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-reference test check bench bench-labels labels train-model setup setup-test setup-bench setup-train clean
+.PHONY: help demo demo-reference test check accuracy bench bench-labels labels train-model setup setup-test setup-bench setup-train clean
 
 help:
 	echo "make demo            render the demo cloud"
@@ -29,6 +31,7 @@ help:
 	echo "make test            all tests (TESTS='tests/unit -k vdb' for some)"
 	echo "make check           style and types"
 	echo "make bench           run time against error (SCENES=folder for other scenes)"
+	echo "make accuracy        how far images, furnace, slabs, held-out labels and hard cases are from the truth"
 	echo "make bench-labels    cost of training labels beside Mitsuba's volpath"
 	echo "make labels          the labels to train on and those to judge by; run again after an interruption, it goes on"
 	echo "make train-model     labels, training and export of the model; run again after an interruption, it goes on"
@@ -73,6 +76,10 @@ labels: setup-train
 	  $(call generate,configs/valid_$${set}_labels.toml -o work/valid_$$set); \
 	  $(call generate,configs/valid_$${set}_labels.toml --tracer mitsuba -o work/valid_$${set}_volpath); \
 	done
+
+# LABELS names folders of held-out labels, as `make labels` makes them.
+accuracy: setup-test
+	$(BIN)/python -m benchmarks.accuracy $(if $(SCENES),--scenes $(SCENES)) $(if $(MODEL),--model $(MODEL)) $(foreach folder,$(LABELS),--labels $(folder))
 
 bench-labels: setup-test
 	$(BIN)/python -m benchmarks.labels
