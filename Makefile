@@ -65,9 +65,9 @@ generate = parts=$$(nproc); running=""; \
 # Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
 	$(call generate,configs/labels.toml -o work/labels)
-	if [ -e work/accurate_run/checkpoint.pt ]; then how=--resume; else how=configs/accurate.toml; fi; \
-	  $(BIN)/deepclouds train $$how -o work/accurate_run
-	$(BIN)/deepclouds export work/accurate_run -o work/accurate.onnx
+	if [ -e work/wide_run/checkpoint.pt ]; then how=--resume; else how=configs/wide.toml; fi; \
+	  $(BIN)/deepclouds train $$how -o work/wide_run
+	$(BIN)/deepclouds export work/wide_run -o work/wide.onnx
 
 # The training labels and the held-out ones that a model is judged by; a tenth of the latter once more by Mitsuba's volpath.
 labels: setup-train

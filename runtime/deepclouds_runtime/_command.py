@@ -214,7 +214,7 @@ def _describe(renderer: Renderer, say: Callable[[str], None]) -> None:
     lights = [f"{len(scene.suns)} sun{'s' if len(scene.suns) > 1 else ''}"] if scene.suns else []
     lights += [scene.environment.class_name()] if scene.environment is not None else []
     say(f"image of {width} x {height} pixels; lights: {', '.join(lights) or 'none'}")
-    for note in scene.notes:
+    for note in renderer.notes:
         say(f"note: {note}")
 
 

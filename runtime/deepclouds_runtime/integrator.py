@@ -47,11 +47,11 @@ def _refuse(properties: Any) -> Any:
     raise InputError(f"the integrator '{NAME}' does not run in Mitsuba's variant '{mi.variant()}'; choose one of {', '.join(VARIANTS)}")
 
 
-@lru_cache(maxsize=1)
-def _predictor(model: str | None) -> Any:
-    from deepclouds_runtime.predictor import Predictor
+@lru_cache(maxsize=2)
+def _predictor(model: str | None, phase: tuple[float, float, float], albedos: tuple[float, ...]) -> Any:
+    from deepclouds_runtime.predictor import predictor_for
 
-    return Predictor(model)
+    return predictor_for(model, phase, albedos)
 
 
 def _integrator_class(mi: Any) -> Any:
@@ -82,7 +82,7 @@ def _integrator_class(mi: Any) -> Any:
             needs_model = self.max_depth != 2 and self.multiple == "network"
             renderer = Renderer(
                 read,
-                _predictor(self.model) if needs_model else None,
+                _predictor(self.model, read.phase, read.albedo) if needs_model else None,
                 multiple=self.multiple,
                 environment_directions=self.environment_directions,
                 interreflection=self.interreflection,

@@ -78,9 +78,9 @@ def load(
         _set_threads(threads)
     scene = _scene(source, path, dict(defines or {}), grid, clamp, options)
     if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
-        from deepclouds_runtime.predictor import Predictor
+        from deepclouds_runtime.predictor import predictor_for
 
-        predictor = Predictor(None if model is None else fspath(model), threads)
+        predictor = predictor_for(None if model is None else fspath(model), scene.phase, scene.albedo, threads)
     return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)
 
 

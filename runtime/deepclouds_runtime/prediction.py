@@ -88,13 +88,13 @@ def predict(
     field = Field(types, volume, scale)
     p, d, s = upload(x), upload(w), upload(suns)
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
-    network = predictor if predictor is not None else _predictor(None if model is None else fspath(model))
+    network = predictor if predictor is not None else _predictor(None if model is None else fspath(model), (g, g2, lobe_weight), albedo)
     j = NetworkScattering(field, network)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)
 
 
-@lru_cache(maxsize=1)
-def _predictor(model: str | None) -> Any:
-    from deepclouds_runtime.predictor import Predictor
+@lru_cache(maxsize=2)
+def _predictor(model: str | None, phase: tuple[float, float, float], albedo: float) -> Any:
+    from deepclouds_runtime.predictor import predictor_for
 
-    return Predictor(model)
+    return predictor_for(model, phase, (albedo,))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
-from deepclouds.model import AUX, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS, ModelMetadata, initialiser_hash
+from deepclouds.model import AUX, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS, ModelMetadata, aux_inputs, initialiser_hash
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
 MODELS = Path(__file__).parent / "models"
-DEFAULT_MODEL = "first"
+# Released models, preferred ones first: a scene is rendered with the first that was trained on its phase function and albedos.
+RELEASED = ("first", "wide")
 # A batch's stencils (9 kB each) and activations then fit into a core's second-level cache.
 BATCH = 512
+# Inputs that a medium fixes for all of its points.
+_OF_MEDIUM = ("g1", "g2", "lobe_weight", "albedo")
 
 
 class Predictor:
@@ -86,6 +90,46 @@ class Predictor:
             counts[spec.name] = int(np.count_nonzero(~((column >= low - slack) & (column <= high + slack))))
         return counts
 
+    def outside(self, phase: tuple[float, float, float], albedos: Iterable[float]) -> list[str]:
+        """What of a medium lies outside of the training data, in words; nothing where the model knows it.
+
+        Parameters
+        ----------
+        phase
+            lobes (g1, g2, weight of lobe 1).
+        albedos
+            single-scattering albedos.
+        """
+        found = []
+        for albedo in sorted(set(albedos)):
+            aux = aux_inputs(0.5 * np.pi, *phase, albedo, 0.0)
+            found += [name for name, count in self.out_of_range(aux).items() if count and name in _OF_MEDIUM]
+        g1, g2, weight = phase
+        values = {"g1": g1, "g2": g2, "lobe_weight": weight, "albedo": min(albedos, default=0.0)}
+        ranges = self.metadata.ranges
+        return [f"{n} = {values[n]:g} (trained on {ranges[n][0]:g} to {ranges[n][1]:g})" for n in _OF_MEDIUM if n in found]
+
+
+def predictor_for(
+    model: str | Path | None, phase: tuple[float, float, float], albedos: Iterable[float], threads: int | None = None
+) -> Predictor:
+    """`model`, or, for None, the preferred one of the released models that were trained on this phase function and these albedos.
+
+    Where none was, it is the one with the fewest inputs outside of its training: `Predictor.outside` says which. Arguments as for
+    `Predictor` and `Predictor.outside`.
+    """
+    if model is not None:
+        return Predictor(model, threads)
+    known = tuple(albedos)
+    found: list[tuple[int, Predictor]] = []
+    for name in RELEASED:
+        predictor = Predictor(name, threads)
+        outside = len(predictor.outside(phase, known))
+        if outside == 0:
+            return predictor
+        found.append((outside, predictor))
+    return min(found, key=lambda pair: pair[0])[1]
+
 
 def find_model(model: str | Path | None) -> Path:
     """The file that `model` means: a path, or the name of a released model.
@@ -95,7 +139,7 @@ def find_model(model: str | Path | None) -> Path:
     InputError
         when there is no such file; the message lists the released ones.
     """
-    name = DEFAULT_MODEL if model is None else model
+    name = RELEASED[0] if model is None else model
     is_name = isinstance(name, str) and not Path(name).suffix and "/" not in name and os.sep not in name
     path = MODELS / f"{name}.onnx" if is_name else Path(name)
     if path.is_file():

@@ -149,6 +149,11 @@ class Renderer:
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
+    Attributes
+    ----------
+    notes
+        what was approximated in reading the scene, and what of its medium the model was not trained on, in sentences.
+
     Raises
     ------
     InputError
@@ -185,6 +190,10 @@ class Renderer:
             self._network = NetworkScattering(self._field, predictor)
         # Single scattering alone stops before light that surfaces have reflected, as volpath with max_depth 2 does.
         self._interreflection = interreflection and scene.surfaces is not None and scene.max_depth != 2
+        self.notes = scene.notes
+        outside = getattr(predictor, "outside", None)
+        if self._network is not None and outside is not None and (unknown := outside(scene.phase, scene.albedo)):
+            self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is extrapolated",)
         self.model_hash: str | None = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
 
@@ -263,7 +272,7 @@ class Renderer:
             if source is not None:
                 statistics.sources[name] = source.summary()
         statistics.skipped = work.skipped()
-        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, statistics, scene.notes)
+        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, statistics, self.notes)
 
     def _lights(self) -> Lights:
         """The lights, with the tables that depend on them: made anew for each render."""

@@ -11,7 +11,7 @@ import onnx
 import pytest
 import torch
 from deepclouds_runtime import predictor
-from deepclouds_runtime.predictor import BATCH, Predictor, find_model
+from deepclouds_runtime.predictor import BATCH, Predictor, find_model, predictor_for
 from deepclouds_training.export import TOLERANCE, export_network, seeded_samples
 from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.trainer import predict
@@ -141,12 +141,22 @@ def test_what_is_no_onnx_file_is_refused(tmp_path: Path) -> None:
 
 def test_names_mean_released_models_and_paths_mean_files(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predictor, "MODELS", model.parent)
-    monkeypatch.setattr(predictor, "DEFAULT_MODEL", "small")
+    monkeypatch.setattr(predictor, "RELEASED", ("small",))
     assert find_model("small") == find_model(None) == find_model(model) == find_model(str(model)) == model
     with pytest.raises(InputError, match=r"no released model is named 'large'; there are: small"):
         find_model("large")
     with pytest.raises(InputError, match="no such model file"):
         find_model("./small")
+
+
+def test_a_medium_gets_the_released_model_that_was_trained_on_it() -> None:
+    """One lobe is the business of the first model, two of the second; of what neither knows the nearer one says so."""
+    one, two, neither = (predictor_for(None, phase, (1.0, 0.9)) for phase in ((0.85, 0.0, 1.0), (0.85, -0.3, 0.8), (0.99, -0.3, 0.8)))
+    assert [p.path.stem for p in (one, two, neither)] == ["first", "wide", "wide"]
+    assert one.outside((0.85, 0.0, 1.0), (1.0, 0.9)) == two.outside((0.85, -0.3, 0.8), (1.0, 0.9)) == []
+    (said,) = neither.outside((0.99, -0.3, 0.8), (1.0,))
+    assert said.startswith("g1 = 0.99 (trained on -0.")
+    assert predictor_for("wide", (0.85, 0.0, 1.0), (1.0,)).path.stem == "wide"
 
 
 def test_predicting_never_loads_torch(model: Path) -> None:
