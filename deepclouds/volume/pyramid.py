@@ -82,6 +82,11 @@ def mean_extinction(volume: Volume) -> float:
     return float(np.einsum("ijk,ijk->", volume.density, volume.density, dtype=np.float64)) / total
 
 
+def optical_size(volume: Volume, scale: float) -> float:
+    """Longest side of the box in units of length of the descriptor: mean free paths at the mean extinction; `scale` as in `Field`."""
+    return float(np.linalg.norm(volume.to_world[:3, :3], axis=0).max()) * scale * mean_extinction(volume)
+
+
 def _cell_weights(samples: int, length: float, start: float, spacing: float) -> tuple[NDArray[np.float64], int]:
     """Matrix (cells, samples) of the exact averages, over cells of `spacing`, of the clamped piecewise linear interpolant along one axis.
 

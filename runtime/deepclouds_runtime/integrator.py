@@ -48,10 +48,10 @@ def _refuse(properties: Any) -> Any:
 
 
 @lru_cache(maxsize=2)
-def _predictor(model: str | None, phase: tuple[float, float, float], albedos: tuple[float, ...]) -> Any:
+def _predictor(model: str | None, phase: tuple[float, float, float], albedos: tuple[float, ...], size: float) -> Any:
     from deepclouds_runtime.predictor import predictor_for
 
-    return predictor_for(model, phase, albedos)
+    return predictor_for(model, phase, albedos, size)
 
 
 def _integrator_class(mi: Any) -> Any:
@@ -74,6 +74,7 @@ def _integrator_class(mi: Any) -> Any:
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
             """Render through the film: a tensor (h, w, channels of the film's pixel format), empty unless `develop`."""
+            from deepclouds.volume.pyramid import optical_size
             from deepclouds_runtime.renderer import Renderer
             from deepclouds_runtime.scene import read_scene
 
@@ -82,7 +83,7 @@ def _integrator_class(mi: Any) -> Any:
             needs_model = self.max_depth != 2 and self.multiple == "network"
             renderer = Renderer(
                 read,
-                _predictor(self.model, read.phase, read.albedo) if needs_model else None,
+                _predictor(self.model, read.phase, read.albedo, optical_size(read.volume, read.scale)) if needs_model else None,
                 multiple=self.multiple,
                 environment_directions=self.environment_directions,
                 interreflection=self.interreflection,

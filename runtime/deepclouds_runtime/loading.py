@@ -78,9 +78,11 @@ def load(
         _set_threads(threads)
     scene = _scene(source, path, dict(defines or {}), grid, clamp, options)
     if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
+        from deepclouds.volume.pyramid import optical_size
         from deepclouds_runtime.predictor import predictor_for
 
-        predictor = predictor_for(None if model is None else fspath(model), scene.phase, scene.albedo, threads)
+        size = optical_size(scene.volume, scene.scale)
+        predictor = predictor_for(None if model is None else fspath(model), scene.phase, scene.albedo, size, threads)
     return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)
 
 

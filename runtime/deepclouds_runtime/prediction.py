@@ -72,6 +72,7 @@ def predict(
     from deepclouds.medium.field import Field
     from deepclouds.medium.optical_depth import optical_depth
     from deepclouds.model import multiple_scattering
+    from deepclouds.volume.pyramid import optical_size
     from deepclouds_runtime.scattering import NetworkScattering
 
     x, w = np.asarray(points, np.float32), np.asarray(directions, np.float32)
@@ -88,13 +89,15 @@ def predict(
     field = Field(types, volume, scale)
     p, d, s = upload(x), upload(w), upload(suns)
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
-    network = predictor if predictor is not None else _predictor(None if model is None else fspath(model), (g, g2, lobe_weight), albedo)
-    j = NetworkScattering(field, network)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
+    if predictor is None:
+        name = None if model is None else fspath(model)
+        predictor = _predictor(name, (g, g2, lobe_weight), albedo, optical_size(volume, scale))
+    j = NetworkScattering(field, predictor)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)
 
 
 @lru_cache(maxsize=2)
-def _predictor(model: str | None, phase: tuple[float, float, float], albedo: float) -> Any:
+def _predictor(model: str | None, phase: tuple[float, float, float], albedo: float, size: float) -> Any:
     from deepclouds_runtime.predictor import predictor_for
 
-    return predictor_for(model, phase, (albedo,))
+    return predictor_for(model, phase, (albedo,), size)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 MODELS = Path(__file__).parent / "models"
-# Released models, preferred ones first: a scene is rendered with the first that was trained on its phase function and albedos.
-RELEASED = ("first", "wide")
+# Released models and the largest clouds that they were trained on, in mean free paths; preferred ones first.
+RELEASED = {"first": 300.0, "wide": 2000.0}
 # A batch's stencils (9 kB each) and activations then fit into a core's second-level cache.
 BATCH = 512
 # Inputs that a medium fixes for all of its points.
@@ -111,24 +111,33 @@ class Predictor:
 
 
 def predictor_for(
-    model: str | Path | None, phase: tuple[float, float, float], albedos: Iterable[float], threads: int | None = None
+    model: str | Path | None, phase: tuple[float, float, float], albedos: Iterable[float], size: float, threads: int | None = None
 ) -> Predictor:
-    """`model`, or, for None, the preferred one of the released models that were trained on this phase function and these albedos.
+    """`model`, or, for None, the preferred one of the released models that were trained on such a medium.
 
-    Where none was, it is the one with the fewest inputs outside of its training: `Predictor.outside` says which. Arguments as for
-    `Predictor` and `Predictor.outside`.
+    Where none was, it is the one with the fewest inputs outside of its training, of equals the later one, which has seen more:
+    `Predictor.outside` says which.
+
+    Parameters
+    ----------
+    model, threads
+        as for `Predictor`.
+    phase, albedos
+        as for `Predictor.outside`.
+    size
+        longest side of the cloud's box in mean free paths, see `deepclouds.volume.pyramid.optical_size`.
     """
     if model is not None:
         return Predictor(model, threads)
     known = tuple(albedos)
     found: list[tuple[int, Predictor]] = []
-    for name in RELEASED:
+    for name, largest in RELEASED.items():
         predictor = Predictor(name, threads)
-        outside = len(predictor.outside(phase, known))
+        outside = len(predictor.outside(phase, known)) + (size > largest)
         if outside == 0:
             return predictor
         found.append((outside, predictor))
-    return min(found, key=lambda pair: pair[0])[1]
+    return min(reversed(found), key=lambda pair: pair[0])[1]
 
 
 def find_model(model: str | Path | None) -> Path:
@@ -139,7 +148,7 @@ def find_model(model: str | Path | None) -> Path:
     InputError
         when there is no such file; the message lists the released ones.
     """
-    name = RELEASED[0] if model is None else model
+    name = next(iter(RELEASED)) if model is None else model
     is_name = isinstance(name, str) and not Path(name).suffix and "/" not in name and os.sep not in name
     path = MODELS / f"{name}.onnx" if is_name else Path(name)
     if path.is_file():

@@ -141,7 +141,7 @@ def test_what_is_no_onnx_file_is_refused(tmp_path: Path) -> None:
 
 def test_names_mean_released_models_and_paths_mean_files(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predictor, "MODELS", model.parent)
-    monkeypatch.setattr(predictor, "RELEASED", ("small",))
+    monkeypatch.setattr(predictor, "RELEASED", {"small": 300.0})
     assert find_model("small") == find_model(None) == find_model(model) == find_model(str(model)) == model
     with pytest.raises(InputError, match=r"no released model is named 'large'; there are: small"):
         find_model("large")
@@ -150,13 +150,16 @@ def test_names_mean_released_models_and_paths_mean_files(model: Path, monkeypatc
 
 
 def test_a_medium_gets_the_released_model_that_was_trained_on_it() -> None:
-    """One lobe is the business of the first model, two of the second; of what neither knows the nearer one says so."""
-    one, two, neither = (predictor_for(None, phase, (1.0, 0.9)) for phase in ((0.85, 0.0, 1.0), (0.85, -0.3, 0.8), (0.99, -0.3, 0.8)))
-    assert [p.path.stem for p in (one, two, neither)] == ["first", "wide", "wide"]
-    assert one.outside((0.85, 0.0, 1.0), (1.0, 0.9)) == two.outside((0.85, -0.3, 0.8), (1.0, 0.9)) == []
-    (said,) = neither.outside((0.99, -0.3, 0.8), (1.0,))
+    """One lobe is the business of the first model, two lobes and large clouds that of the second; so is what neither knows."""
+    one, two, both = (0.85, 0.0, 1.0), (0.85, -0.3, 0.8), (0.99, -0.3, 0.8)
+    cases = [(one, 100.0, "first"), (two, 100.0, "wide"), (one, 1000.0, "wide"), (both, 100.0, "wide"), (one, 5000.0, "wide")]
+    for phase, size, name in cases:
+        assert predictor_for(None, phase, (1.0, 0.9), size).path.stem == name, (phase, size)
+    first, wide = Predictor("first"), Predictor("wide")
+    assert first.outside(one, (1.0, 0.9)) == wide.outside(two, (1.0, 0.9)) == []
+    (said,) = wide.outside(both, (1.0,))
     assert said.startswith("g1 = 0.99 (trained on -0.")
-    assert predictor_for("wide", (0.85, 0.0, 1.0), (1.0,)).path.stem == "wide"
+    assert predictor_for("wide", one, (1.0,), 100.0).path.stem == "wide"
 
 
 def test_predicting_never_loads_torch(model: Path) -> None:
