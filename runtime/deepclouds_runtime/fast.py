@@ -12,7 +12,7 @@ from deepclouds_runtime import stratified
 from deepclouds_runtime.frame_source import FrameSource
 from deepclouds_runtime.march import depths, gathered
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.transport import Cloud, CloudLight, Counts, Lights, opacity_of, single_scattering
+from deepclouds_runtime.transport import Cloud, CloudLight, Counts, Lights, opacity_of, single_scattering, taker
 
 
 def fast_cloud_light(
@@ -57,8 +57,7 @@ def fast_cloud_light(
     lanes: Any = dr.compress(meets)
     if len(lanes) == 0:
         return result
-    o, d = _take(types, origin, lanes), _take(types, direction, lanes)
-    e = dr.gather(types.Float, end, lanes) if dr.width(end) > 1 else end
+    o, d, e = map(taker(types, lanes), (origin, direction, end))
     own = numbers.take(lanes)
     jitter = own.number(stratified.MARCH)
     octrees = [source.octree for source in sources]
@@ -77,22 +76,18 @@ def fast_cloud_light(
     if len(filled) == 0:
         return result
     lanes = dr.gather(types.UInt32, lanes, filled)
-    o, d = _take(types, o, filled), _take(types, d, filled)
-    e, jitter, hidden = (dr.gather(types.Float, v, filled) if dr.width(v) > 1 else v for v in (e, jitter, hidden))
+    o, d, e, jitter, hidden = map(taker(types, filled), (o, d, e, jitter, hidden))
     own = own.take(filled)
     distance = depths(medium, o, d, e, jitter, hidden, own.number(stratified.SHARE), count, types.Bool(True))
     dr.eval(distance)
     dr.scatter(result.distance, dr.block_sum(distance, count) * (1 / count), lanes)
     if any(a > 0 for a in cloud.albedo):
         lane = dr.arange(types.UInt32, len(filled) * count) // dr.opaque(types.UInt32, count)
-        w = _take(types, d, lane)
-        points = dr.fma(w, distance, _take(types, o, lane))
+        take = taker(types, lane)
+        w = take(d)
+        points = dr.fma(w, distance, take(o))
         single = single_scattering(replace(cloud, scattering=None), lights, points, w, own.several(count))
         dr.eval(single)
         for c in range(channels):
             dr.scatter(result.direct[c], dr.block_sum(single[c], count) * hidden * (1 / count), lanes)
     return result
-
-
-def _take(types: Any, vector: Any, lanes: Any) -> Any:
-    return types.Array3f(*(dr.gather(types.Float, v, lanes) if dr.width(v) > 1 else v for v in vector))

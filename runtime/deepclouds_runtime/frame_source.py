@@ -24,7 +24,7 @@ from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_
 from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.transport import Cloud, opacity_of
+from deepclouds_runtime.transport import Cloud, opacity_of, taker
 
 Array = NDArray[Any]
 _LEVELS = 7
@@ -103,16 +103,12 @@ def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, cou
     n = len(lanes)
     if n == 0:
         return Seen(np.empty((0, 3)), np.empty(0))
-    origin, direction = (_take(types, v, lanes) for v in (origin, direction))
-    end, hidden, shift = (dr.gather(types.Float, v, lanes) if dr.width(v) > 1 else v for v in (end, hidden, shift))
+    origin, direction, end, hidden, shift = map(taker(types, lanes), (origin, direction, end, hidden, shift))
     distance = depths(field, origin, direction, end, types.Float(0.5), hidden, shift, count, types.Bool(True))
     lane = dr.arange(types.UInt32, n * count) // dr.opaque(types.UInt32, count)
-    points = dr.fma(_take(types, direction, lane), distance, _take(types, origin, lane))
+    take = taker(types, lane)
+    points = dr.fma(take(direction), distance, take(origin))
     return Seen(np.array(points).T.astype(np.float64), np.repeat(np.array(hidden, np.float64) / count, count))
-
-
-def _take(types: Any, vector: Any, lanes: Any) -> Any:
-    return types.Array3f(*(dr.gather(types.Float, v, lanes) if dr.width(v) > 1 else v for v in vector))
 
 
 @dataclass(frozen=True)

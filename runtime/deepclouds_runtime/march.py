@@ -11,6 +11,7 @@ import drjit as dr
 
 from deepclouds.medium.field import Field
 from deepclouds_runtime.octree import DeviceOctree
+from deepclouds_runtime.transport import depth_of
 
 # The share of light that is left behind this depth is below a float32's digits of what came before it.
 _OPAQUE = 16.0
@@ -89,7 +90,7 @@ def depths(field: Field, origin: Any, direction: Any, end: Any, jitter: Any, hid
     tau = dr.zeros(types.Float, n)
     index = dr.zeros(types.Float, n)
     asked = shift + dr.zeros(types.Float, n)
-    target = _depth(asked / many * hidden)
+    target = depth_of(asked / many * hidden)
     going = active & (steps > 0)
     while going:
         near = first + index * width
@@ -104,7 +105,7 @@ def depths(field: Field, origin: Any, direction: Any, end: Any, jitter: Any, hid
         if inside:
             slot += 1
             asked += 1
-            target = _depth(asked / many * hidden)
+            target = depth_of(asked / many * hidden)
         else:
             tau = reached
             index += 1
@@ -118,7 +119,3 @@ def _steps(field: Field, origin: Any, direction: Any, end: Any, active: Any) -> 
     length = dr.select(active, dr.maximum(dr.minimum(leave, end) - enter, 0), 0)
     steps = dr.ceil(length / dr.opaque(field.types.Float, field.step))
     return enter, steps, length / dr.maximum(steps, 1), field.to_unit(origin), field.direction_to_unit(direction)
-
-
-def _depth(hidden: Any) -> Any:
-    return dr.select(hidden < 1e-2, hidden * (1 + hidden * (0.5 + hidden * (1 / 3))), -dr.log(dr.maximum(1 - hidden, 1e-30)))

@@ -145,14 +145,16 @@ def cloud_light(
     counts.cloud_samples += len(lanes)
     if len(lanes) == 0 or not any(a > 0 for a in cloud.albedo):
         return result
-    take = _taker(types, lanes)
+    take = taker(types, lanes)
     d = take(direction)
     points = dr.fma(d, take(distance), take(origin))
     _scatter(cloud, lights, points, d, take(opacity), take(weight), numbers.take(lanes), counts, lanes, result)
     return result
 
 
-def _taker(types: Any, lanes: Any) -> Any:
+def taker(types: Any, lanes: Any) -> Callable[[Any], Any]:
+    """Function that takes the lanes with these indices out of a Float or an Array3f; what is the same for all lanes stays as it is."""
+
     def take(value: Any) -> Any:
         if dr.depth_v(value) > 1:
             return types.Array3f(*(take(c) for c in value))
@@ -182,7 +184,7 @@ def _scatter(
     asked = numbers.number(stratified.ROULETTE) < keep
     queries: Any = dr.compress(asked) if cloud.scattering is not None else types.UInt32()
     weight = dr.gather(types.Float, opacity / keep, queries)
-    take = _taker(types, queries)
+    take = taker(types, queries)
     target = dr.gather(types.UInt32, lanes, queries)
 
     def predict(omega: Any, radiance: list[Any], tau: Any) -> None:
