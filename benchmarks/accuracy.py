@@ -26,11 +26,11 @@ from benchmarks.accuracy_scenes import SceneResult, measure_scene
 from benchmarks.accuracy_slabs import SlabResult, measure_slab, slab_rows
 from benchmarks.accuracy_special import CaseResult, measure_case
 from benchmarks.bench import find_scenes, machine
+from benchmarks.page import write_results
 from deepclouds.errors import InputError
 from deepclouds.replacing import replacing
 
 ROOT = Path(__file__).resolve().parents[1]
-MARKS = ("<!-- results: written by `python -m benchmarks.accuracy --docs` -->", "<!-- end of results -->")
 _TITLES = {
     "scene": "Scenes",
     "furnace": "White furnace",
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for picture in pictures:
             shutil.copyfile(picture, ROOT / "docs" / "images" / picture.name)
         shown = "\n\n".join(f"![{p.stem.replace('_', ', ')}](images/{p.name})" for p in pictures)
-        write_page(ROOT / "docs" / "accuracy.md", f"{body}\n\n{shown}")
+        write_results(ROOT / "docs" / "accuracy.md", "accuracy", f"{body}\n\n{shown}")
     print()
     for row in results.rows:
         print(row.line)
@@ -174,16 +174,6 @@ def markdown(results: Results) -> str:
     head = "| depth | g | albedo | sun's zenith angle | reflected | exact | transmitted | exact |"
     lines += ["### Slabs, case by case", "", head, "|---" * 8 + "|", *(result.cells for result in results.slabs)]
     return "\n".join(lines)
-
-
-def write_page(page: Path, body: str) -> None:
-    """Replace what lies between the marks of `page`; raises InputError when the marks are not there once each."""
-    text = page.read_text(encoding="utf-8") if page.is_file() else ""
-    if not all(text.count(mark) == 1 for mark in MARKS):
-        raise InputError(f"{page}: needs the lines '{MARKS[0]}' and '{MARKS[1]}' once each, to put the results between")
-    head, tail = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
-    with replacing(page, ".md") as temporary:
-        temporary.write_text(f"{head}{MARKS[0]}\n\n{body}\n\n{MARKS[1]}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from benchmarks.equal_error import Bounded, Timing, interpolated_seconds, unbiased_seconds
+from benchmarks.page import write_results
 from benchmarks.worker import DEFAULT_SPP, METHODS
 from deepclouds.errors import InputError
 from deepclouds.exr import read_exr
@@ -31,7 +32,6 @@ from deepclouds.metrics import ErrorReport, error_report
 from deepclouds.replacing import replacing
 
 ROOT = Path(__file__).resolve().parent.parent
-_MARKS = ("<!-- results: written by `python -m benchmarks.bench --docs` -->", "<!-- end of results -->")
 _LABELS = {
     "deepclouds": "deepclouds",
     "reference": "deepclouds, every sample asks",
@@ -342,20 +342,11 @@ def write_docs(rows: Sequence[Row], table: str, docs: Path = ROOT / "docs") -> N
     InputError
         when the page or its marks are missing.
     """
-    page = docs / "benchmark.md"
-    text = page.read_text(encoding="utf-8") if page.is_file() else ""
-    if not all(text.count(mark) == 1 for mark in _MARKS):
-        raise InputError(f"{page}: needs the lines '{_MARKS[0]}' and '{_MARKS[1]}' once each, to put the results between")
-    write_plots(docs / "images", rows)
     scenes = dict.fromkeys(r.scene for r in rows)
     pictures = "\n".join(f"![time against error, {s}](images/bench_{s}.png)" for s in scenes) if find_spec("matplotlib") is not None else ""
     ratios = "\n".join(f"- {line}" for line in speed_ups(rows))
-    head, tail = text.split(_MARKS[0])[0], text.split(_MARKS[1])[1]
-    body = f"\n\nMeasured on: {machine()}\n\n{ratios}\n\n{table}\n\n{pictures}\n\n"
-    content = head + _MARKS[0] + body + _MARKS[1] + tail
-
-    with replacing(page, ".md") as temporary:
-        temporary.write_text(content, encoding="utf-8")
+    write_results(docs / "benchmark.md", "bench", f"Measured on: {machine()}\n\n{ratios}\n\n{table}\n\n{pictures}")
+    write_plots(docs / "images", rows)
 
 
 def _spp_list(flag: str, text: str, least: int) -> list[int]:

@@ -21,11 +21,11 @@ from benchmarks.bench import machine
 from benchmarks.label_cost import ALBEDOS, CLOUDS, SUNS, Cost, compile_seconds, make_task, our_cost, volpath_cost, volpath_speed
 from benchmarks.label_information import Effort, Worth, information
 from benchmarks.label_volpath import VARIANTS
+from benchmarks.page import write_results
 from deepclouds.errors import InputError
 from deepclouds.replacing import replacing
 
 ROOT = Path(__file__).resolve().parents[1]
-MARKS = ("<!-- results: written by `python -m benchmarks.labels --docs` -->", "<!-- end of results -->")
 LABELS_A_WALK = SUNS * len(ALBEDOS)
 
 
@@ -107,7 +107,7 @@ def run(size: Size, out: Path, page: Path | None) -> int:
             f"Measured on: {machine()}. volpath: {variants}; {best} is used. Our first call: {compiling:.2f} core-s "
             "(kernels of earlier runs are cached on disk)."
         )
-        write_page(page, f"{notes}\n\n{tables}")
+        write_results(page, "labels", f"{notes}\n\n{tables}")
     print(f"\n{tables}\n\nwrote {out}/labels.csv" + (" and labels.png" if plotted else "; no plot: matplotlib is missing"))
     print(headline(rows))
     return 0
@@ -209,16 +209,6 @@ def write_plot(path: Path, rows: Sequence[Row], worth: dict[str, Worth]) -> bool
     with replacing(path, ".png") as temporary:
         figure.savefig(temporary, dpi=120)
     return True
-
-
-def write_page(page: Path, body: str) -> None:
-    """Replace what lies between the marks of `page`; InputError when the marks are not there once each."""
-    text = page.read_text(encoding="utf-8") if page.is_file() else ""
-    if not all(text.count(mark) == 1 for mark in MARKS):
-        raise InputError(f"{page}: needs the lines '{MARKS[0]}' and '{MARKS[1]}' once each, to put the results between")
-    head, tail = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
-    with replacing(page, ".md") as temporary:
-        temporary.write_text(f"{head}{MARKS[0]}\n\n{body}\n\n{MARKS[1]}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":

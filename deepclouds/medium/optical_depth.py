@@ -36,7 +36,7 @@ def optical_depth(
         lanes to compute; the others return 0.
     """
     types = field.types
-    first, steps, width, base, along = _march(field, origin, direction, start, end, active)
+    first, steps, width, base, along = steps_along(field, origin, direction, start, end, active)
     tau = dr.zeros(types.Float, dr.width(steps))
     index = dr.zeros(types.Float, dr.width(steps))
     going = active & (steps > 0)
@@ -57,7 +57,7 @@ def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any,
     distance is that of its end.
     """
     types = field.types
-    first, steps, width, base, along = _march(field, origin, direction, start, end, active)
+    first, steps, width, base, along = steps_along(field, origin, direction, start, end, active)
     tau = dr.zeros(types.Float, dr.width(steps))
     index = dr.zeros(types.Float, dr.width(steps))
     found = first + dr.zeros(types.Float, dr.width(steps))
@@ -95,7 +95,7 @@ def _empty_steps(
     return empty, step
 
 
-def _march(field: Field, origin: Any, direction: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+def steps_along(field: Field, origin: Any, direction: Any, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
     """A segment inside the box in equal steps: where it starts, their number and width, and the ray in the unit cube's coordinates."""
     enter, leave = field.intersect(origin, direction)
     first = dr.maximum(enter, start)

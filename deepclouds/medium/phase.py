@@ -84,6 +84,18 @@ def as_lobes(phase: ArrayLike) -> NDArray[np.float32]:
     return rows
 
 
+def ordered_lobes(phase: tuple[float, float, float]) -> tuple[float, float, float]:
+    """The same phase function with the heavier lobe first, and (g, 0, 1) where it has one lobe: the form in which a network reads it."""
+    g1, g2, weight = phase
+    if weight == 1 or g1 == g2:
+        return g1, 0.0, 1.0
+    if weight == 0:
+        return g2, 0.0, 1.0
+    if (weight, g1) < (1 - weight, g2):
+        return g2, g1, 1 - weight
+    return g1, g2, weight
+
+
 def rotate_to(direction: Any, cosine: Any, azimuth: Any) -> Any:
     """Unit vectors at `cosine` and `azimuth` (radians) around the unit vectors `direction` (Duff et al. 2017, JCGT 6(1))."""
     import drjit as dr

@@ -10,6 +10,7 @@ from typing import Any
 import drjit as dr
 
 from deepclouds.medium.field import Field
+from deepclouds.medium.optical_depth import steps_along
 from deepclouds_runtime.octree import DeviceOctree
 from deepclouds_runtime.transport import depth_of
 
@@ -39,7 +40,7 @@ def gathered(
         lanes to compute; the others return 0.
     """
     types = field.types
-    first, steps, width, base, along = _steps(field, origin, direction, end, active)
+    first, steps, width, base, along = steps_along(field, origin, direction, types.Float(0), end, active)
     starts, aheads = [s.to_local(origin) for s in sources], [s.direction_to_local(direction) for s in sources]
     tau = dr.zeros(types.Float, dr.width(steps))
     index = dr.zeros(types.Float, dr.width(steps))
@@ -82,7 +83,7 @@ def depths(field: Field, origin: Any, direction: Any, end: Any, jitter: Any, hid
     """
     types = field.types
     n = dr.width(origin, direction)
-    first, steps, width, base, along = _steps(field, origin, direction, end, active)
+    first, steps, width, base, along = steps_along(field, origin, direction, types.Float(0), end, active)
     found = dr.zeros(types.Float, n * count)
     many = dr.opaque(types.Float, count)
     slot = dr.arange(types.UInt32, n) * dr.opaque(types.UInt32, count)
@@ -111,11 +112,3 @@ def depths(field: Field, origin: Any, direction: Any, end: Any, jitter: Any, hid
             index += 1
         going = going & (slot < last) & (index < steps)
     return found
-
-
-def _steps(field: Field, origin: Any, direction: Any, end: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """The part of rays inside the box in equal steps: where it starts, their number and width, and the rays in the unit cube."""
-    enter, leave = field.intersect(origin, direction)
-    length = dr.select(active, dr.maximum(dr.minimum(leave, end) - enter, 0), 0)
-    steps = dr.ceil(length / dr.opaque(field.types.Float, field.step))
-    return enter, steps, length / dr.maximum(steps, 1), field.to_unit(origin), field.direction_to_unit(direction)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.medium.phase import ordered_lobes
 from deepclouds.model import AUX, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS, ModelMetadata, aux_inputs, initialiser_hash
 
 if TYPE_CHECKING:
@@ -90,28 +91,30 @@ class Predictor:
             counts[spec.name] = int(np.count_nonzero(~((column >= low - slack) & (column <= high + slack))))
         return counts
 
-    def outside(self, phase: tuple[float, float, float], albedos: Iterable[float]) -> list[str]:
+    def outside(self, phase: tuple[float, float, float], albedos: Sequence[float]) -> list[str]:
         """What of a medium lies outside of the training data, in words; nothing where the model knows it.
 
         Parameters
         ----------
         phase
-            lobes (g1, g2, weight of lobe 1).
+            lobes (g1, g2, weight of lobe 1), in any order.
         albedos
             single-scattering albedos.
         """
-        found = []
-        for albedo in sorted(set(albedos)):
-            aux = aux_inputs(0.5 * np.pi, *phase, albedo, 0.0)
-            found += [name for name, count in self.out_of_range(aux).items() if count and name in _OF_MEDIUM]
-        g1, g2, weight = phase
-        values = {"g1": g1, "g2": g2, "lobe_weight": weight, "albedo": min(albedos, default=0.0)}
-        ranges = self.metadata.ranges
-        return [f"{n} = {values[n]:g} (trained on {ranges[n][0]:g} to {ranges[n][1]:g})" for n in _OF_MEDIUM if n in found]
+        found: dict[str, str] = {}
+        lobes = ordered_lobes(phase)
+        for albedo in albedos:
+            values = dict(zip(_OF_MEDIUM, (*lobes, albedo), strict=True))
+            counts = self.out_of_range(aux_inputs(0.5 * np.pi, *lobes, albedo, 0.0))
+            for name in _OF_MEDIUM:
+                if counts[name]:
+                    low, high = self.metadata.ranges[name]
+                    found[name] = f"{name} = {values[name]:g} (trained on {low:g} to {high:g})"
+        return list(found.values())
 
 
 def predictor_for(
-    model: str | Path | None, phase: tuple[float, float, float], albedos: Iterable[float], size: float, threads: int | None = None
+    model: str | Path | None, phase: tuple[float, float, float], albedos: Sequence[float], size: float, threads: int | None = None
 ) -> Predictor:
     """`model`, or, for None, the preferred one of the released models that were trained on such a medium.
 
@@ -129,11 +132,10 @@ def predictor_for(
     """
     if model is not None:
         return Predictor(model, threads)
-    known = tuple(albedos)
     found: list[tuple[int, Predictor]] = []
     for name, largest in RELEASED.items():
         predictor = Predictor(name, threads)
-        outside = len(predictor.outside(phase, known)) + (size > largest)
+        outside = len(predictor.outside(phase, albedos)) + (size > largest)
         if outside == 0:
             return predictor
         found.append((outside, predictor))

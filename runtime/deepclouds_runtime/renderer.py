@@ -300,6 +300,8 @@ class _Work:
     sums: dict[str, Image] = field(default_factory=dict)
     samples: int = 0
     sources: list[FrameSource] | None = None
+    named: dict[str, FrameSource] = field(default_factory=dict)
+    all_round: AllRound | None = None
 
     def __post_init__(self) -> None:
         width, height = self.scene.size
@@ -307,9 +309,6 @@ class _Work:
         self._active = np.arange(width * height, dtype=np.uint32)
         self.taken = np.zeros(width * height, np.float32)
         self._variance = np.zeros((width * height, 3), np.float64)
-
-    named: dict[str, FrameSource] = field(default_factory=dict)
-    all_round: AllRound | None = None
 
     def skipped(self) -> dict[str, int]:
         """Queries that were not needed, by reason; a sample counts as the one query that the reference mode would ask."""
@@ -342,11 +341,10 @@ class _Work:
         out = types.Array3f(*(types.Float(np.ascontiguousarray(around[:, c])) for c in range(3)))
         parts = []
         for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
-            interaction, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
+            _, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
             found: Any = dr.compress(shown)
             place = dr.fma(ahead, distance, start)
             parts.append([np.array(dr.gather(types.Float, v, found)) for v in place])
-            del interaction
         places = np.concatenate([np.stack(part, axis=1) for part in parts])
         if len(places):
             # Toward points spread through the cloud's sphere.

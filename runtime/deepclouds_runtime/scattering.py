@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from deepclouds.descriptor import LEVELS, POINTS, Descriptor
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
+from deepclouds.medium.phase import ordered_lobes
 from deepclouds.model import aux_inputs
 
 Phase = tuple[float, float, float]
@@ -83,7 +84,7 @@ class NetworkScattering:
             for k, level in enumerate(self.descriptor.levels(*part)):
                 stencil[:, k] = level.numpy().reshape(-1, POINTS)
             for m, albedo in enumerate(albedos):
-                aux = aux_inputs(gamma[start:stop], *phase, albedo, depth[start:stop])
+                aux = aux_inputs(gamma[start:stop], *ordered_lobes(phase), albedo, depth[start:stop])
                 result[start:stop, m] = self.predictor.predict(stencil, aux)
         return result
 

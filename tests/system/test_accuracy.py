@@ -19,6 +19,7 @@ from benchmarks.accuracy_figures import bootstrap, noise_free
 from benchmarks.accuracy_furnace import FurnaceCloud, furnace_rows, plan, tile_means
 from benchmarks.accuracy_slabs import Slab, cases, discrete_ordinates, leaving_flux
 from benchmarks.bench import ROOT
+from benchmarks.page import marks, write_results
 from deepclouds.backend import backend
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
@@ -148,15 +149,15 @@ def test_the_exact_fluxes_are_those_of_the_published_table() -> None:
 
 def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "accuracy.md"
-    page.write_text("before\n" + "\nold\n".join(accuracy.MARKS) + "\nafter\n")
-    accuracy.write_page(page, "new")
-    assert page.read_text() == f"before\n{accuracy.MARKS[0]}\n\nnew\n\n{accuracy.MARKS[1]}\nafter\n"
+    page.write_text("before\n" + "\nold\n".join(marks("accuracy")) + "\nafter\n")
+    write_results(page, "accuracy", "new")
+    assert page.read_text() == f"before\n{marks('accuracy')[0]}\n\nnew\n\n{marks('accuracy')[1]}\nafter\n"
     page.write_text("no marks")
     with pytest.raises(InputError, match="once each"):
-        accuracy.write_page(page, "new")
+        write_results(page, "accuracy", "new")
     # The page that is there can be written.
     text = (ROOT / "docs" / "accuracy.md").read_text()
-    assert all(text.count(mark) == 1 for mark in accuracy.MARKS)
+    assert all(text.count(mark) == 1 for mark in marks("accuracy"))
 
 
 def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixture[str], llvm_mitsuba: object) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks import bench, make_scenes, worker
 from benchmarks.equal_error import Timing, interpolated_seconds, unbiased_seconds
+from benchmarks.page import marks
 from deepclouds.errors import InputError
 from deepclouds.exr import read_exr
 from deepclouds.metrics import ErrorReport, error_report
@@ -87,14 +88,14 @@ def test_medians_of_scenes_by_what_lights_them() -> None:
 
 def test_results_replace_only_what_lies_between_the_marks(tmp_path: Path) -> None:
     page = tmp_path / "benchmark.md"
-    page.write_text("before\n" + "\n\nold figures\n\n".join(bench._MARKS) + "\nafter\n")
+    page.write_text("before\n" + "\n\nold figures\n\n".join(marks("bench")) + "\nafter\n")
     (tmp_path / "images").mkdir()
     rows = [row("volpath", 16, 2.0, 0.4), row("deepclouds", 0, 0.5, 0.1)]
     for _ in range(2):
         bench.write_docs(rows, bench.markdown(rows), tmp_path)
         text = page.read_text()
-        assert text.startswith("before\n" + bench._MARKS[0])
-        assert text.endswith(bench._MARKS[1] + "\nafter\n")
+        assert text.startswith("before\n" + marks("bench")[0])
+        assert text.endswith(marks("bench")[1] + "\nafter\n")
         assert "old figures" not in text
         assert text.count("| s | volpath |") == 1
     page.write_text("no marks")

@@ -19,6 +19,7 @@ from benchmarks import label_cost, labels
 from benchmarks.label_cost import PHASES, TARGET, Cost, Task, effective_labels
 from benchmarks.label_information import Labels, Worth, judge, train
 from benchmarks.label_volpath import draw_directions
+from benchmarks.page import marks, write_results
 from deepclouds.backend import backend
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
@@ -97,13 +98,13 @@ def test_the_last_line_is_the_median_over_repetitions() -> None:
 
 def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "labels.md"
-    page.write_text("before\n" + "\nold\n".join(labels.MARKS) + "\nafter\n")
+    page.write_text("before\n" + "\nold\n".join(marks("labels")) + "\nafter\n")
     for _ in range(2):
-        labels.write_page(page, "figures")
-        assert page.read_text() == f"before\n{labels.MARKS[0]}\n\nfigures\n\n{labels.MARKS[1]}\nafter\n"
+        write_results(page, "labels", "figures")
+        assert page.read_text() == f"before\n{marks('labels')[0]}\n\nfigures\n\n{marks('labels')[1]}\nafter\n"
     page.write_text("no marks")
     with pytest.raises(InputError, match="once each"):
-        labels.write_page(page, "figures")
+        write_results(page, "labels", "figures")
 
 
 def test_a_quick_run(tmp_path: Path, capsys: pytest.CaptureFixture[str], scalar_mitsuba: object) -> None:

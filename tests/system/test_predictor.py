@@ -159,6 +159,7 @@ def test_a_medium_gets_the_released_model_that_was_trained_on_it() -> None:
     assert first.outside(one, (1.0, 0.9)) == wide.outside(two, (1.0, 0.9)) == []
     (said,) = wide.outside(both, (1.0,))
     assert said.startswith("g1 = 0.99 (trained on -0.")
+    assert wide.outside((-0.3, 0.85, 0.2), (1.0,)) == []
     assert predictor_for("wide", one, (1.0,), 100.0).path.stem == "wide"
 
 

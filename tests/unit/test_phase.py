@@ -13,6 +13,7 @@ from deepclouds.medium.phase import (
     as_lobes,
     hg,
     hg_numpy,
+    ordered_lobes,
     rotate_to,
     sample_hg_cosine,
     sample_two_lobe_cosine,
@@ -176,3 +177,22 @@ def test_rotate_to_at_the_ends_of_the_range() -> None:
     np.testing.assert_allclose(rotate(d, np.ones(50), np.full(50, 1.0)), d, atol=1e-6)
     np.testing.assert_allclose(rotate(d, -np.ones(50), np.full(50, 1.0)), -d, atol=1e-6)
     assert not dr.any(dr.isnan(backend().Float(rotate(d, np.full(50, np.nextafter(1, 2)), np.zeros(50)).ravel())))
+
+
+def test_ordered_lobes_are_the_same_phase_function_in_one_form() -> None:
+    cosine = np.linspace(-1, 1, 33)
+    for phase in (
+        (0.8, -0.3, 0.7),
+        (-0.3, 0.8, 0.3),
+        (0.5, -0.2, 0.5),
+        (-0.2, 0.5, 0.5),
+        (0.6, 0.1, 1.0),
+        (0.1, 0.6, 0.0),
+        (0.4, 0.4, 0.2),
+    ):
+        ordered = ordered_lobes(phase)
+        np.testing.assert_allclose(two_lobe_numpy(cosine, *ordered), two_lobe_numpy(cosine, *phase), rtol=1e-12)
+        assert ordered[2] >= 0.5
+    assert ordered_lobes((-0.3, 0.8, 0.3)) == (0.8, -0.3, 0.7)
+    assert ordered_lobes((-0.2, 0.5, 0.5)) == ordered_lobes((0.5, -0.2, 0.5)) == (0.5, -0.2, 0.5)
+    assert ordered_lobes((0.1, 0.6, 0.0)) == (0.6, 0.0, 1.0)
