@@ -42,7 +42,7 @@ def optical_depth(
     going = active & (steps > 0)
     while going:
         at = dr.fma(along, first + (index + jitter) * width, base)
-        empty, step = _empty_steps(field, at, base, along, first, width, index, jitter, going)
+        empty, step = empty_steps(field, at, base, along, first, width, index, jitter, going)
         tau += width * field.sigma_t_unit(at, going & ~empty)
         index += step
         going = going & (index < steps) & (tau < opaque)
@@ -67,7 +67,7 @@ def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any,
         near = first + index * width
         at = dr.fma(along, near + jitter * width, base)
         # A target that is reached already lies at the end of the first step.
-        empty, step = _empty_steps(field, at, base, along, first, width, index, jitter, going & (tau < target))
+        empty, step = empty_steps(field, at, base, along, first, width, index, jitter, going & (tau < target))
         sigma = field.sigma_t_unit(at, going & ~empty)
         reached = tau + width * sigma
         inside = reached >= target
@@ -81,10 +81,14 @@ def distance_at(field: Field, origin: Any, direction: Any, start: Any, end: Any,
 
 
 @dr.syntax
-def _empty_steps(
+def empty_steps(
     field: Field, at: Any, base: Any, along: Any, first: Any, width: Any, index: Any, jitter: Any, active: Any
 ) -> tuple[Any, Any]:
-    """Whether step `index`, which reads `at`, lies in an empty brick, and the number of steps to the next that may read something."""
+    """Whether step `index`, which reads `at`, lies in an empty brick, and the number of steps to the next that may read something.
+
+    `base`, `along`, `first` and `width` are those of `steps_along`; a march that adds `step` to its index, and reads nothing where the
+    brick is empty, sums the same values in the same order as one that takes every step.
+    """
     types = field.types
     empty, step = types.Bool(False), types.Float(1)
     if dr.hint(field.majorants.any_empty, mode="scalar"):

@@ -1,6 +1,7 @@
 """Marches of the fast mode: one that adds up a known source along rays, and one that finds several depths at once.
 
-Both walk the steps of `deepclouds.medium.optical_depth` with its jitter, so that their optical depths are its own.
+Both walk the steps of `deepclouds.medium.optical_depth` with its jitter and leave out empty bricks as it does, so that their optical
+depths are its own.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Any
 import drjit as dr
 
 from deepclouds.medium.field import Field
-from deepclouds.medium.optical_depth import steps_along
+from deepclouds.medium.optical_depth import empty_steps, steps_along
 from deepclouds_runtime.octree import DeviceOctree
 from deepclouds_runtime.transport import depth_of
 
@@ -48,7 +49,9 @@ def gathered(
     going = active & (steps > 0)
     while going:
         near = first + index * width
-        sigma = field.sigma_t_unit(dr.fma(along, near + jitter * width, base), going)
+        at = dr.fma(along, near + jitter * width, base)
+        empty, leap = empty_steps(field, at, base, along, first, width, index, jitter, going)
+        sigma = field.sigma_t_unit(at, going & ~empty)
         filled = going & (sigma > 0)
         step = sigma * width
         hidden = dr.select(step < 1e-2, step * (1 - 0.5 * step), 1 - dr.exp(-step))
@@ -61,7 +64,7 @@ def gathered(
             for k in range(len(values)):
                 sums[i][k] += dr.select(filled, share * values[k], 0)
         tau += step
-        index += 1
+        index += leap
         going = going & (index < steps) & (tau < _OPAQUE)
     return tau, sums
 
@@ -95,13 +98,16 @@ def depths(field: Field, origin: Any, direction: Any, end: Any, jitter: Any, hid
     going = active & (steps > 0)
     while going:
         near = first + index * width
-        sigma = field.sigma_t_unit(dr.fma(along, near + jitter * width, base), going)
+        at = dr.fma(along, near + jitter * width, base)
+        # A target that is reached already lies at the end of the first step.
+        empty, leap = empty_steps(field, at, base, along, first, width, index, jitter, going & (tau < target))
+        sigma = field.sigma_t_unit(at, going & ~empty)
         reached = tau + width * sigma
-        # The last step holds what rounding left over.
-        over = index + 1 >= steps
-        inside = going & ((reached >= target) | over)
-        fraction = dr.select(sigma > 0, (target - tau) / dr.maximum(sigma * width, 1e-30), 1.0)
-        dr.scatter(found, near + dr.clip(fraction, 0, 1) * width, slot, inside)
+        # The end of the ray holds what rounding left over.
+        left = steps - index
+        inside = going & ((reached >= target) | (leap >= left))
+        fraction = dr.select(sigma > 0, dr.clip((target - tau) / dr.maximum(sigma * width, 1e-30), 0, 1), dr.minimum(leap, left))
+        dr.scatter(found, near + fraction * width, slot, inside)
         # A step may hold several collisions: it is left when the next one lies beyond it.
         if inside:
             slot += 1
@@ -109,6 +115,6 @@ def depths(field: Field, origin: Any, direction: Any, end: Any, jitter: Any, hid
             target = depth_of(asked / many * hidden)
         else:
             tau = reached
-            index += 1
+            index += leap
         going = going & (slot < last) & (index < steps)
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from deepclouds_runtime.all_round import DIRECTIONS, fit, harmonics, spread
@@ -136,6 +137,37 @@ def test_collisions_lie_in_equal_shares_of_what_is_hidden() -> None:
         expected = (k + shift) / count * hidden
         np.testing.assert_allclose(-np.expm1(-before)[hidden > 0.1], expected[hidden > 0.1], atol=0.02)
     assert np.all(np.diff(found[hidden > 0.1], axis=1) > 0)
+
+
+def test_marches_leave_out_empty_bricks() -> None:
+    """Against fields of one brick, which is never empty: the same depths and sums to the bit, the same distances but for rounding."""
+    rng, n = np.random.default_rng(10), 5000
+    density = np.zeros((30, 41, 26), np.float32)
+    for _ in range(20):
+        at = [int(rng.integers(0, m - 4)) for m in density.shape]
+        density[tuple(slice(a, a + 4) for a in at)] = rng.random((4, 4, 4))
+    volume = Volume.from_box(density, (-1, -1, -1), (1, 1, 1))
+    points = rng.uniform(-1, 1, (500, 3))
+    lattice = lattice_around(np.full(3, 2.0), np.full(3, -1.0), np.eye(3), 0.5)
+    octree = Octree(lattice, _bump, points, np.ones(500), 0.05, 2000, 3).upload(types)
+    origin = rng.uniform(-3, 3, (n, 3))
+    direction = rng.uniform(-1, 1, (n, 3)) - origin
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    o, d, end = _upload(origin), _upload(direction), types.Float(rng.choice([2.0, 3.0, math.inf], n))
+    jitter, shift = (types.Float(rng.random(n).astype(np.float32)) for _ in range(2))
+    results = []
+    for brick in (None, 4):
+        field = Field(types, volume, 8.0, brick=brick)
+        assert field.majorants.any_empty == (brick is not None)
+        tau, sums = gathered(field, [octree], o, d, end, jitter, types.Float(0.6), types.Bool(True))
+        found = depths(field, o, d, end, jitter, 1 - dr.exp(-tau), shift, 3, types.Bool(True))
+        results.append((np.array(tau), np.array(sums[0][0]), np.array(found)))
+    (tau_plain, sum_plain, plain), (tau, total, skipping) = results
+    assert np.count_nonzero(tau_plain) > 500
+    assert sum_plain.max() > 0
+    np.testing.assert_array_equal(tau, tau_plain)
+    np.testing.assert_array_equal(total, sum_plain)
+    np.testing.assert_allclose(skipping.reshape(n, 3)[tau > 0], plain.reshape(n, 3)[tau > 0], rtol=1e-6)
 
 
 def test_harmonics_keep_what_varies_slowly() -> None:
