@@ -114,7 +114,7 @@ def test_a_run_says_everything_about_itself(small_dataset: Path, tmp_path: Path)
 def test_a_run_can_set_out_from_the_averaged_weights_of_another(small_dataset: Path, tmp_path: Path) -> None:
     first = trainer(tmp_path / "first", settings(small_dataset))
     assert first.train(lambda: False)
-    expected = first.average.averaged(first.network).state_dict()
+    expected = first.learner.averaged().state_dict()
     second = trainer(tmp_path / "second", settings(small_dataset, start=str(tmp_path / "first"), seed=5))
     assert all(torch.equal(value, second.network.state_dict()[name]) for name, value in expected.items())
     assert second.step == 0

@@ -48,4 +48,4 @@ class WeightAverage:
         assert isinstance(updates, int)
         assert isinstance(sums, list)
         self.updates = updates
-        self._sums = [s.clone() for s in sums]
+        self._sums = [s.to(p.device, copy=True) for s, p in zip(sums, self._parameters, strict=True)]

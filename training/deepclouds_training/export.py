@@ -38,17 +38,18 @@ def main(argv: Sequence[str], prog: str = "deepclouds export") -> int:
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--ema", action="store_true", help="the averaged weights (default)")
     which.add_argument("--raw", action="store_true", help="the weights of the last step")
+    parser.add_argument("--companion", action="store_true", help="the small network that was trained beside the large one")
     parser.add_argument("--name", help="the model's name in its metadata (default: the file's name)")
     options = parser.parse_args(argv)
     name = options.name or options.output.stem
-    metadata, error = export_run(options.run, options.output, raw=options.raw, name=name)
+    metadata, error = export_run(options.run, options.output, raw=options.raw, name=name, companion=options.companion)
     log.info("%s: %s, contract %s, largest relative difference from torch %.1e", options.output, name, metadata.contract, error)
     return 0
 
 
-def export_run(folder: Path, target: Path, raw: bool, name: str) -> tuple[ModelMetadata, float]:
-    """Export the last checkpoint of the run in `folder`; returns the metadata and the largest relative difference from torch."""
-    from deepclouds_training.average import WeightAverage
+def export_run(folder: Path, target: Path, raw: bool, name: str, companion: bool = False) -> tuple[ModelMetadata, float]:
+    """Export the last checkpoint of the run in `folder`, or its companion; returns the metadata and the largest relative difference."""
+    from deepclouds_training.learner import averaged_network
     from deepclouds_training.network import Network
     from deepclouds_training.run_folder import RunFolder
     from deepclouds_training.shards import open_dataset
@@ -58,12 +59,16 @@ def export_run(folder: Path, target: Path, raw: bool, name: str) -> tuple[ModelM
     state = run.load_checkpoint()
     if state is None or state["step"] == 0:
         raise InputError(f"{folder}: has no trained weights yet; let `deepclouds train` reach its first checkpoint")
-    network = Network(config.network)
-    network.load_state_dict(state["network"])
-    if not raw:
-        average = WeightAverage(network, config.ema)
-        average.load_state_dict(state["average"])
-        network = average.averaged(network)
+    shape, learned = config.network, state
+    if companion:
+        if config.companion is None:
+            raise InputError(f"{folder}: was trained without a companion; leave --companion out, or train with a [companion] table")
+        shape, learned = config.companion, state["companion"]
+    if raw:
+        network = Network(shape)
+        network.load_state_dict(learned["network"])
+    else:
+        network = averaged_network(shape, learned, config.ema)
     try:
         dataset = open_dataset(config.data)
         stencil, aux = _real_samples(dataset, run.shards(dataset), config.samples.backend)
@@ -76,7 +81,7 @@ def export_run(folder: Path, target: Path, raw: bool, name: str) -> tuple[ModelM
         "ranges": {key: (low, high) for key, (low, high) in state["ranges"].items()},
         "config_hash": config.hash,
         "dataset_hash": run.data_hash,
-        "metrics": {"step": float(state["step"]), "ema": float(not raw), **_last_figures(run.metrics(), state["step"])},
+        "metrics": {"step": float(state["step"]), "ema": float(not raw), **_last_figures(run.metrics(), state["step"], companion)},
     }
     return export_network(network, target, metadata, stencil, aux)
 
@@ -203,13 +208,17 @@ def _real_samples(dataset: Any, shards: Any, backend: Any) -> tuple[NDArray[np.f
     return samples.stencil, samples.aux
 
 
-def _last_figures(metrics: list[dict[str, Any]], step: int) -> dict[str, float]:
-    """The last validation at or before `step`, flattened."""
+def _last_figures(metrics: list[dict[str, Any]], step: int, companion: bool) -> dict[str, float]:
+    """The last validation at or before `step`, flattened; that of the companion where it is asked for."""
     validations = [entry for entry in metrics if entry["kind"] == "valid" and entry["step"] <= step]
     if not validations:
         return {}
     last = validations[-1]
-    flat = {f"{family}.{name}": float(value) for family, figures in last["figures"].items() for name, value in figures.items()}
+    flat = {
+        f"{family}.{name}": float(value)
+        for family, figures in last["companion" if companion else "figures"].items()
+        for name, value in figures.items()
+    }
     return {"validated_at_step": float(last["step"]), **flat}
 
 

@@ -22,6 +22,7 @@ ENVIRONMENT = "environment.json"
 METRICS = "metrics.jsonl"
 CHECKPOINT = "checkpoint.pt"
 PICTURE = "predicted.png"
+EVENTS = "events"
 
 
 class RunFolder:
@@ -34,6 +35,11 @@ class RunFolder:
     def picture(self) -> Path:
         """Where the predicted-against-true plot goes."""
         return self.path / PICTURE
+
+    @property
+    def events(self) -> Path:
+        """Where the TensorBoard events go."""
+        return self.path / EVENTS
 
     def refuse_existing(self) -> None:
         """Raise InputError when the folder already holds a run."""

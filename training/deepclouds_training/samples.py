@@ -82,6 +82,8 @@ class SampleSource:
         how samples are drawn.
     seed
         root of the random streams: pool k is a function of the shards, `config`, `seed` and k alone.
+    part
+        (i, n): build the i-th of n equal parts of every pool, n a divisor of `config.shards`.
 
     Raises
     ------
@@ -89,7 +91,9 @@ class SampleSource:
         when there are no shards.
     """
 
-    def __init__(self, dataset: Dataset, shards: tuple[ShardInfo, ...], config: SampleConfig, seed: int) -> None:
+    def __init__(
+        self, dataset: Dataset, shards: tuple[ShardInfo, ...], config: SampleConfig, seed: int, part: tuple[int, int] = (0, 1)
+    ) -> None:
         if not shards:
             raise InputError(f"{dataset.folder}: no shards to draw samples from; `deepclouds generate` makes more")
         self.dataset = dataset
@@ -99,25 +103,51 @@ class SampleSource:
         self._types = backend(config.backend)
         self._cache: dict[int, tuple[Shard, Extinction]] = {}
         self._free_bytes = config.cache_gb * 2**30
+        each = config.shards // part[1]
+        self._slots = range(part[0] * each, (part[0] + 1) * each)
         self._pool: Samples | None = None
+        self._held: int | None = None
 
     def pool(self, k: int, interrupted: Callable[[], bool] = lambda: False) -> Samples | None:
-        """Pool `k`, or None when `interrupted` said so between two shards. It is valid until the next call, which reuses its memory."""
-        config = self.config
+        """Build this source's part of pool `k`, or return None when `interrupted` said so between two shards.
+
+        It is valid until another one is asked for, which reuses its memory; asked for again, it is not built again.
+        """
         if self._pool is None:
-            self._pool = _empty(config.shards * config.queries)
-        for i in range(config.shards):
-            if interrupted():
+            self._pool = _empty(len(self._slots) * self.config.queries)
+        if self._held != k:
+            self._held = None
+            if not self._fill(self._pool, k, self._slots, interrupted):
                 return None
+            self._held = k
+        return self._pool
+
+    def whole_pool(self, k: int) -> Samples:
+        """All parts of pool `k`, in memory of their own."""
+        pool = _empty(self.config.shards * self.config.queries)
+        self._fill(pool, k, range(self.config.shards), lambda: False)
+        return pool
+
+    def own(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of some `rows` of a whole pool that lie in this source's part, as rows of the part."""
+        low, high = (slot * self.config.queries for slot in (self._slots.start, self._slots.stop))
+        return rows[(rows >= low) & (rows < high)] - low
+
+    def _fill(self, pool: Samples, k: int, slots: range, interrupted: Callable[[], bool]) -> bool:
+        """Build the shards of pool `k` in `slots` into `pool`; False when interrupted."""
+        config = self.config
+        for place_number, i in enumerate(slots):
+            if interrupted():
+                return False
             number, visit = self._turn(k * config.shards + i)
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(1, number, visit)))
             factor = config.unit_jitter ** rng.uniform(-1.0, 1.0)
-            place = slice(i * config.queries, (i + 1) * config.queries)
-            part = self.draw(self.shards[number], config.queries, rng, factor, config.mirror, self._pool.stencil[place])
+            place = slice(place_number * config.queries, (place_number + 1) * config.queries)
+            part = self.draw(self.shards[number], config.queries, rng, factor, config.mirror, pool.stencil[place])
             for field in fields(Samples):
                 if field.name != "stencil":
-                    getattr(self._pool, field.name)[place] = getattr(part, field.name)
-        return self._pool
+                    getattr(pool, field.name)[place] = getattr(part, field.name)
+        return True
 
     def every_shard(self, queries: int) -> Samples:
         """The same `queries` of every shard, with the unit of length as it is: a validation set."""

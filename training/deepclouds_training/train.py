@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from deepclouds.errors import InputError
 
 if TYPE_CHECKING:
+    from deepclouds_training.processes import Processes
     from deepclouds_training.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -26,7 +27,8 @@ def main(argv: Sequence[str], prog: str = "deepclouds train") -> int:
     parser = argparse.ArgumentParser(
         prog=prog,
         description="Fit the network to labelled shards. RUN receives the resolved configuration, metrics.jsonl, checkpoint.pt and "
-        "predicted.png; Ctrl-C saves a checkpoint, and --resume continues as if nothing had happened.",
+        "predicted.png; Ctrl-C saves a checkpoint, and --resume continues as if nothing had happened. Several processes share the work "
+        "when torchrun starts them: torchrun --nproc-per-node 2 -m deepclouds_training.train CONFIG.toml -o RUN",
     )
     parser.add_argument("config", metavar="CONFIG.toml", type=Path, nargs="?", help="the run's settings; with --resume RUN has its own")
     parser.add_argument("-o", "--output", metavar="RUN", type=Path, required=True, help="folder of the run")
@@ -35,7 +37,9 @@ def main(argv: Sequence[str], prog: str = "deepclouds train") -> int:
     parser.add_argument("--new-data", action="store_true", help="with --resume: take in shards generated since the run began")
     parser.add_argument("--steps", type=int, help="length of the schedule, optimiser steps; overrides the file")
     parser.add_argument("--minutes", type=float, help="length of the schedule, minutes of training in all; overrides the file")
-    parser.add_argument("--threads", type=int, help="threads of the optimiser (default: all processors)")
+    parser.add_argument(
+        "--threads", type=int, help="threads of the optimiser (default: all processors, shared by this machine's processes)"
+    )
     parser.add_argument("--seed", type=int, help="root of the random streams; overrides the file")
     options = parser.parse_args(argv)
     if options.threads is not None and options.threads < 1:
@@ -43,14 +47,29 @@ def main(argv: Sequence[str], prog: str = "deepclouds train") -> int:
     if options.new_data and not options.resume:
         raise InputError("--new-data goes with --resume; a new run takes every shard anyway")
 
+    from deepclouds_training.processes import Processes
+
+    with Processes() as processes:
+        return _train(options, prog, processes)
+
+
+def _train(options: argparse.Namespace, prog: str, processes: Processes) -> int:
     import torch
 
+    from deepclouds_training.pace import pace_text
     from deepclouds_training.run_folder import RunFolder
     from deepclouds_training.shards import open_dataset
     from deepclouds_training.train_config import checked, read_config
     from deepclouds_training.trainer import Trainer
 
-    torch.set_num_threads(options.threads or os.cpu_count() or 1)
+    torch.set_num_threads(options.threads or max(1, (os.cpu_count() or 1) // processes.local_count))
+    if processes.local_count > 1:
+        import drjit
+
+        drjit.set_thread_count(torch.get_num_threads())
+    if not processes.writes:
+        # What all of them have to say is said once.
+        logging.getLogger("deepclouds_training").setLevel(logging.WARNING)
     run = RunFolder(options.output)
     overrides = {"data": options.data, "steps": options.steps, "minutes": options.minutes, "seed": options.seed}
     if options.resume:
@@ -59,10 +78,12 @@ def main(argv: Sequence[str], prog: str = "deepclouds train") -> int:
         given = {key: value for key, value in overrides.items() if value is not None}
         config = checked({**run.config().model_dump(), **given}, "command line")
         dataset = open_dataset(config.data)
-        if options.new_data:
+        if options.new_data and processes.writes:
             run.adopt(dataset)
+        processes.wait()
         shards = run.shards(dataset)
-        run.save_config(config)
+        if processes.writes:
+            run.save_config(config)
     else:
         if options.config is None:
             raise InputError("name a CONFIG.toml, or continue a run with --resume")
@@ -70,16 +91,21 @@ def main(argv: Sequence[str], prog: str = "deepclouds train") -> int:
         dataset = open_dataset(config.data)
         shards = dataset.shards
         run.refuse_existing()
-    trainer = Trainer(config, run, dataset, shards)
+        processes.wait()
+    trainer = Trainer(config, run, dataset, shards, processes)
     if not options.resume:
-        run.begin(config, dataset)
+        if processes.writes:
+            run.begin(config, dataset)
     else:
         log.info("resuming at step %d" if trainer.resumed else "no checkpoint yet: starting at step %d", trainer.step)
     with _interrupts() as interrupted:
-        display = _Bar() if sys.stderr.isatty() else None
+        display = _Bar() if sys.stderr.isatty() and processes.writes else None
         if not trainer.train(lambda: interrupted[0], display):
             log.info("interrupted at step %d; continue with: %s --resume -o %s", trainer.step, prog, options.output)
             return 130
+    log.info("%s", pace_text(trainer.pace.rates()))
+    if trainer.progress() < 1.0:
+        log.info("stopped early: %d validations in a row without a new best", config.patience)
     log.info("done: %d steps in %.1f minutes; next: deepclouds export %s -o model.onnx", trainer.step, trainer.elapsed / 60, options.output)
     return 0
 
@@ -119,3 +145,10 @@ class _Bar:
     def show(self, trainer: Trainer, loss: float) -> None:
         """Move the bar to where `trainer` is."""
         self._progress.update(self._task, completed=trainer.progress(), description=f"step {trainer.step}, loss {loss:.4f}")
+
+
+if __name__ == "__main__":
+    # torchrun starts modules; the command adds logging and exit codes.
+    from deepclouds.cli import main as command
+
+    sys.exit(command(["train", *sys.argv[1:]]))

@@ -41,12 +41,23 @@ class TrainConfig(BaseModel):
         arithmetic of the hidden layers' products in training; weights, loss, averages and validation are float32 either way.
     network, samples
         the network's shape and the samples' selection.
+    companion
+        shape of a small network that is trained on the same batches beside the large one and learns from it; None trains none.
+    companion_mix
+        what it learns from: this part of the large network's prediction, the rest of the label. The label is unbiased and noisy, the
+        prediction nearly free of noise, but the large network's errors are in it.
+    frozen
+        do not train the large network, which `start` names: it is the teacher of the companion alone.
     valid_shards, valid_queries, valid_every
         validation clouds, queries drawn from each, and steps between validations.
     checkpoint_seconds
         longest time between checkpoints.
+    patience
+        validations in a row without a new best rRMSE or energy that end the run before its schedule does; None never ends it.
     tensorboard
-        write TensorBoard events as well.
+        write TensorBoard events as well, to the folder ``events`` of the run.
+    device
+        where the networks are trained: ``auto`` takes a CUDA device if there is one. Stencils are built where `samples.backend` says.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -65,11 +76,16 @@ class TrainConfig(BaseModel):
     precision: Literal["float32", "bfloat16"] = "float32"
     network: NetworkConfig = NetworkConfig()
     samples: SampleConfig = SampleConfig()
+    companion: NetworkConfig | None = None
+    companion_mix: float = Field(default=0.5, ge=0, le=1)
+    frozen: bool = False
     valid_shards: int = Field(default=48, ge=1)
     valid_queries: int = Field(default=1024, ge=2)
     valid_every: int = Field(default=1000, ge=1)
     checkpoint_seconds: float = Field(default=100.0, ge=0, le=120)
+    patience: int | None = Field(default=None, ge=1)
     tensorboard: bool = False
+    device: Literal["auto", "cpu", "cuda"] = "auto"
 
     @property
     def hash(self) -> str:
@@ -100,4 +116,6 @@ def checked(values: Mapping[str, Any], source: str) -> TrainConfig:
     pool = config.samples.shards * config.samples.queries
     if config.batch > pool:
         raise InputError(f"{source}: batch {config.batch} exceeds a pool of {pool} samples; raise samples.shards or samples.queries")
+    if config.frozen and (config.start is None or config.companion is None):
+        raise InputError(f"{source}: frozen trains a companion alone; name the teacher's run with start, and give a [companion] table")
     return config
