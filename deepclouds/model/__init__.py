@@ -13,6 +13,7 @@ from deepclouds.model.contract import (
     multiple_scattering,
 )
 from deepclouds.model.metadata import DescriptorSpec, ModelMetadata, initialiser_hash
+from deepclouds.model.trust import Trust
 
 __all__ = [
     "AUX",
@@ -25,6 +26,7 @@ __all__ = [
     "AuxInput",
     "DescriptorSpec",
     "ModelMetadata",
+    "Trust",
     "aux_inputs",
     "initialiser_hash",
     "multiple_scattering",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from deepclouds.errors import InputError
 from deepclouds.model.contract import AUX, CONTRACT_VERSION, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS
+from deepclouds.model.trust import VERSION as TRUST_VERSION
+from deepclouds.model.trust import Trust
 
 PREFIX = "deepclouds."
 
@@ -75,6 +78,12 @@ class ModelMetadata(BaseModel):
         figures of the validation, by name.
     initialisers_sha256
         `initialiser_hash` over the graph's initialisers.
+    size
+        smallest and largest cloud of the training data: longest side of its box in mean free paths, see
+        `deepclouds.volume.pyramid.optical_size`. None where it is not known.
+    trust
+        how far predictions can be trusted, as `deepclouds calibrate` finds it; None for a model without, and where it is of a version that
+        this program does not know.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -93,6 +102,21 @@ class ModelMetadata(BaseModel):
     dataset_hash: str
     metrics: dict[str, float]
     initialisers_sha256: str
+    size: tuple[float, float] | None = None
+    trust: Trust | None = None
+
+    @field_validator("size")
+    @classmethod
+    def _ordered_size(cls, size: tuple[float, float] | None) -> tuple[float, float] | None:
+        if size is not None and not (0 <= size[0] <= size[1] < float("inf")):
+            raise ValueError(f"size must be finite and ordered, got {size}")
+        return size
+
+    @field_validator("trust", mode="before")
+    @classmethod
+    def _known_trust(cls, trust: Any) -> Any:
+        # Advice about the network, and no part of what it computes: a model is of use without it.
+        return None if isinstance(trust, dict) and trust.get("version") != TRUST_VERSION else trust
 
     @field_validator("ranges")
     @classmethod
@@ -106,8 +130,8 @@ class ModelMetadata(BaseModel):
         return ranges
 
     def to_properties(self) -> dict[str, str]:
-        """The metadata as a flat dictionary of strings: plain text where a field is text, JSON elsewhere."""
-        fields = self.model_dump(mode="json")
+        """The metadata as a flat dictionary of strings: plain text where a field is text, JSON elsewhere; without what is not known."""
+        fields = self.model_dump(mode="json", exclude_none=True)
         return {PREFIX + key: value if isinstance(value, str) else json.dumps(value, sort_keys=True) for key, value in fields.items()}
 
     @staticmethod

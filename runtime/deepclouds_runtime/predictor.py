@@ -13,17 +13,20 @@ from numpy.typing import NDArray
 from deepclouds.errors import InputError
 from deepclouds.medium.phase import ordered_lobes
 from deepclouds.model import AUX, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS, ModelMetadata, aux_inputs, initialiser_hash
+from deepclouds.model.trust import FLOOR
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
 MODELS = Path(__file__).parent / "models"
-# Released models and the largest clouds that they were trained on, in mean free paths; preferred ones first.
-RELEASED = {"first": 300.0, "wide": 2000.0}
+# Released models, preferred ones first.
+RELEASED = ("first", "wide")
 # A batch's stencils (9 kB each) and activations then fit into a core's second-level cache.
 BATCH = 512
 # Inputs that a medium fixes for all of its points.
 _OF_MEDIUM = ("g1", "g2", "lobe_weight", "albedo")
+# Training varies the unit of length by a factor of 2: a few per cent more or less in size are nothing new.
+_SLACK_SIZE = 0.05
 
 
 class Predictor:
@@ -81,6 +84,21 @@ class Predictor:
             raise ValueError(f"{bad} of {n} predictions of {self.path} are not finite; check the inputs for NaN")
         return j
 
+    def errors(self, stencil: NDArray[np.float32], aux: NDArray[np.float32], j: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Errors (n,) to expect of predictions j (n,): root of the mean square, in units of j; None for a model that knows none.
+
+        They rise with the distance from the training data and are calibrated on held-out labels: `deepclouds.model.trust`.
+        """
+        trust = self.metadata.trust
+        if trust is None:
+            return None
+        result = np.empty(len(j), np.float32)
+        # What one batch reads again is still in the cache.
+        for start in range(0, len(j), BATCH):
+            rows = slice(start, start + BATCH)
+            result[rows] = trust.expected_error(trust.distance(stencil[rows], aux[rows]), j[rows]) * (j[rows] + FLOOR)
+        return result
+
     def out_of_range(self, aux: NDArray[np.float32]) -> dict[str, int]:
         """How many of the rows `aux` (n, 6) lie outside of what the model was trained on, for every input."""
         counts = {}
@@ -91,7 +109,7 @@ class Predictor:
             counts[spec.name] = int(np.count_nonzero(~((column >= low - slack) & (column <= high + slack))))
         return counts
 
-    def outside(self, phase: tuple[float, float, float], albedos: Sequence[float]) -> list[str]:
+    def outside(self, phase: tuple[float, float, float], albedos: Sequence[float], size: float | None = None) -> list[str]:
         """What of a medium lies outside of the training data, in words; nothing where the model knows it.
 
         Parameters
@@ -100,6 +118,9 @@ class Predictor:
             lobes (g1, g2, weight of lobe 1), in any order.
         albedos
             single-scattering albedos.
+        size
+            longest side of the cloud's box in mean free paths, see `deepclouds.volume.pyramid.optical_size`; None leaves it out, and so does
+            a model that does not say what sizes it knows.
         """
         found: dict[str, str] = {}
         lobes = ordered_lobes(phase)
@@ -110,6 +131,10 @@ class Predictor:
                 if counts[name]:
                     low, high = self.metadata.ranges[name]
                     found[name] = f"{name} = {values[name]:g} (trained on {low:g} to {high:g})"
+        if size is not None and self.metadata.size is not None:
+            low, high = self.metadata.size
+            if not low * (1 - _SLACK_SIZE) <= size <= high * (1 + _SLACK_SIZE):
+                found["size"] = f"a cloud of {size:.3g} mean free paths (trained on {low:g} to {high:g})"
         return list(found.values())
 
 
@@ -133,9 +158,9 @@ def predictor_for(
     if model is not None:
         return Predictor(model, threads)
     found: list[tuple[int, Predictor]] = []
-    for name, largest in RELEASED.items():
+    for name in RELEASED:
         predictor = Predictor(name, threads)
-        outside = len(predictor.outside(phase, albedos)) + (size > largest)
+        outside = len(predictor.outside(phase, albedos, size))
         if outside == 0:
             return predictor
         found.append((outside, predictor))
@@ -150,7 +175,7 @@ def find_model(model: str | Path | None) -> Path:
     InputError
         when there is no such file; the message lists the released ones.
     """
-    name = next(iter(RELEASED)) if model is None else model
+    name = RELEASED[0] if model is None else model
     is_name = isinstance(name, str) and not Path(name).suffix and "/" not in name and os.sep not in name
     path = MODELS / f"{name}.onnx" if is_name else Path(name)
     if path.is_file():
