@@ -1,7 +1,7 @@
 """How far a prediction can be trusted: a distance from the training data, and the relative error to expect.
 
-Ten levels of a stencil and a row of ``aux`` are summed up in a few numbers. Their distance from the training data, in units of the data's own
-spread (Mahalanobis 1936), says how unusual a query is. Held-out labels say what error goes with a distance and with a prediction: dark
+Ten levels of a stencil and a row of ``aux`` are summed up in a few numbers. Their distance from the training data, in units of the data's
+own spread (Mahalanobis 1936), says how unusual a query is. Held-out labels say what error goes with a distance and with a prediction: dark
 places are predicted worse, relatively, than bright ones.
 """
 
@@ -24,6 +24,8 @@ LARGEST = 1.5
 SUMMARY = 2 * LEVELS + 7
 # As the network's own compression (`deepclouds_training.network`): the fourth root of the optical depth across a spacing.
 _ROOT_FLOOR = 0.05
+# Points of a level on its axis toward the light, beyond the middle.
+_AXIS = slice(3 * 25 + 12, POINTS, 25)
 
 
 class Trust(BaseModel):
@@ -77,7 +79,8 @@ class Trust(BaseModel):
 
     def distance(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> Floats:
         """Distance (n,) of stencils (n, 10, 225) with rows ``aux`` (n, 6) from the training data: root of the mean square, of order 1."""
-        whitened = (summaries(stencil, aux) - np.array(self.mean)) @ np.array(self.whitening)
+        # Not a matrix product: the threads of a linear algebra library go on spinning for a while and take the tracer's processors.
+        whitened = np.einsum("nk,kl->nl", summaries(stencil, aux) - np.array(self.mean), np.array(self.whitening))
         result: Floats = np.sqrt(np.mean(np.square(whitened), axis=1))
         return result
 
@@ -101,8 +104,7 @@ def summaries(stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> Floats:
         the network's inputs, (n, 10, 225) and (n, 6), see docs/contract.md.
     """
     n = len(aux)
-    # One product over all levels: a pass over the stencil is all that this costs beside the network.
-    means = (stencil.reshape(n * LEVELS, POINTS) @ _WEIGHTS).reshape(n, LEVELS, 2)
+    means = np.stack([stencil.mean(axis=2), stencil[:, :, _AXIS].mean(axis=2)], axis=2)
     depth = np.maximum(means, 0) * np.exp2(np.arange(LEVELS, dtype=np.float32))[:, None]
     gamma, g1, g2, weight, albedo, log1p_tau = aux.astype(np.float64).T
     phase = weight * _henyey_greenstein(gamma, g1) + (1 - weight) * _henyey_greenstein(gamma, g2)
@@ -123,13 +125,3 @@ def _henyey_greenstein(gamma: Floats, g: Floats) -> Floats:
     denominator = np.maximum(1 + g * g - 2 * g * np.cos(gamma), 1e-8)
     value: Floats = np.maximum(1 - g * g, 1e-8) / (denominator * np.sqrt(denominator))
     return value
-
-
-def _weights() -> NDArray[np.float32]:
-    """Weights (225, 2) of the points of a level in its mean and in the mean of its axis toward the light."""
-    place = np.arange(POINTS)
-    axis = (place % 25 == 12) & (place // 25 > 2)
-    return np.stack([np.full(POINTS, 1 / POINTS), axis / axis.sum()], axis=1).astype(np.float32)
-
-
-_WEIGHTS = _weights()

@@ -53,6 +53,8 @@ class FrameSource:
         asked of the network.
     lights
         directions that light comes from.
+    doubt
+        two more fields, where the network knows its errors: the sum of `octree`'s, and the error to expect of it.
     """
 
     octree: DeviceOctree
@@ -61,6 +63,7 @@ class FrameSource:
     error: float
     queries: int
     lights: int
+    doubt: DeviceOctree | None = None
 
     def summary(self) -> dict[str, Any]:
         """What it took, for a report."""
@@ -87,10 +90,11 @@ class Sees(Protocol):
 
 @dataclass(frozen=True)
 class Seen:
-    """Samples of what the camera sees of the cloud: world points (n, 3) and their shares of the image (n,)."""
+    """Samples of what the camera sees of the cloud: world points (n, 3), their shares of the image (n,), the numbers of their rays (n,)."""
 
     points: Array
     weights: Array
+    rays: Array
 
 
 def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, count: int) -> Seen:
@@ -102,13 +106,14 @@ def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, cou
     lanes: Any = dr.compress(hidden > 0)
     n = len(lanes)
     if n == 0:
-        return Seen(np.empty((0, 3)), np.empty(0))
+        return Seen(np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))
     origin, direction, end, hidden, shift = map(taker(types, lanes), (origin, direction, end, hidden, shift))
     distance = depths(field, origin, direction, end, types.Float(0.5), hidden, shift, count, types.Bool(True))
     lane = dr.arange(types.UInt32, n * count) // dr.opaque(types.UInt32, count)
     take = taker(types, lane)
     points = dr.fma(take(direction), distance, take(origin))
-    return Seen(np.array(points).T.astype(np.float64), np.repeat(np.array(hidden, np.float64) / count, count))
+    weights = np.repeat(np.array(hidden, np.float64) / count, count)
+    return Seen(np.array(points).T.astype(np.float64), weights, np.repeat(np.array(lanes, np.int64), count))
 
 
 @dataclass(frozen=True)
@@ -208,10 +213,11 @@ def frame_source(
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
     checks = min(max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes))), len(seen.points) // 2)
     held_out, built_for = _split(seen, checks)
-    octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS)
+    octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS, predicted.carried)
     device = octree.upload(field.types)
     factor, error = _audit(device, predicted, held_out, every)
-    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights))
+    doubt = octree.upload(field.types, carried=True) if predicted.carried else None
+    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights), doubt)
 
 
 class _Predicted:
@@ -228,6 +234,8 @@ class _Predicted:
     ) -> None:
         self._cloud, self._network, self._lights, self._albedos, self._eyes, self._combine = cloud, network, lights, albedos, eyes, combine
         self.queries = 0
+        # What one eye sees is looked at itself; of several, only mixtures are.
+        self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
         square = np.array(cloud.albedo) ** 2 / (4 * math.pi)
         tint = _tint(lights)
         self._brightest = -1
@@ -244,31 +252,39 @@ class _Predicted:
             self._of_field = list(range(len(albedos)))
 
     def __call__(self, points: Array) -> Array:
-        """Fields (n, l) at world points (n, 3)."""
+        """Fields (n, l) at world points (n, 3); the last `carried` of them are the sum of the others and the error to expect of it."""
         n = len(points)
         total = np.zeros((len(self._eyes), n, self.mix.shape[1]), np.float32)
+        error = np.zeros(n, np.float32)
         pairs = [(e, light) for e in range(len(self._eyes)) for light in self._lights]
         at_once = max(1, _AT_ONCE // max(n, 1))
         for first in range(0, len(pairs), at_once):
-            self._add(points, pairs[first : first + at_once], total)
-        return self._combine(total)
+            self._add(points, pairs[first : first + at_once], total, error)
+        combined = self._combine(total)
+        return np.concatenate([combined, combined.sum(axis=1, keepdims=True), error[:, None]], axis=1) if self.carried else combined
 
-    def _add(self, points: Array, pairs: Sequence[tuple[int, Arriving]], total: Array) -> None:
+    def _add(self, points: Array, pairs: Sequence[tuple[int, Arriving]], total: Array, error: Array) -> None:
         types, field, n = self._cloud.field.types, self._cloud.field, len(points)
         x = _upload(types, np.tile(points, (len(pairs), 1)))
         d = _upload(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
         omega = _upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
         tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), _DEEP)
         dr.eval(tau)
-        j = self._network(x, d, omega, self._cloud.phase, self._albedos, tau).reshape(len(pairs), n, -1)
+        query = x, d, omega, self._cloud.phase, self._albedos, tau
+        j, errors = self._network.with_errors(*query) if self.carried else (self._network(*query), None)
         self.queries += j.size
+        j = j.reshape(len(pairs), n, -1)
+        errors = np.zeros_like(j) if errors is None else errors.reshape(j.shape)
         x = _upload(types, points)
-        for (e, light), values in zip(pairs, j, strict=True):
+        for (e, light), values, expected in zip(pairs, j, errors, strict=True):
             arriving = light.at(x)
             dr.eval(arriving)
             for f, k in enumerate(self._of_field):
                 if k >= 0:
-                    total[e, :, f] += np.array(arriving[f if self._brightest < 0 else self._brightest]) * values[:, k]
+                    irradiance = np.array(arriving[f if self._brightest < 0 else self._brightest])
+                    total[e, :, f] += irradiance * values[:, k]
+                    # Errors of several lights add up: what makes a network err under one sun does so under the next.
+                    error += irradiance * expected[:, k]
 
 
 def _upload(types: Any, values: Array) -> Any:
@@ -291,7 +307,7 @@ def _split(seen: Seen, count: int) -> tuple[Seen, Seen]:
     chosen = np.minimum(np.searchsorted(total, places), len(total) - 1)
     rest = np.ones(len(total), bool)
     rest[chosen] = False
-    return Seen(seen.points[chosen], np.ones(count)), Seen(seen.points[rest], seen.weights[rest])
+    return Seen(seen.points[chosen], np.ones(count), seen.rays[chosen]), Seen(seen.points[rest], seen.weights[rest], seen.rays[rest])
 
 
 def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: Seen, every: int) -> tuple[float, float]:
@@ -302,7 +318,7 @@ def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: See
     """
     if not len(checks.points):
         return 1.0, 0.0
-    true = evaluate(checks.points).astype(np.float64)[:, ::every]
+    true = evaluate(checks.points)[:, : octree.fields].astype(np.float64)[:, ::every]
     values = octree.lookup(octree.to_local(_upload(octree.types, checks.points)), octree.types.Bool(True))
     dr.eval(values)
     interpolated = np.stack([np.array(v, np.float64) for v in values[::every]], axis=1)

@@ -17,7 +17,7 @@ from deepclouds_runtime.scene import CloudScene, read_scene
 from deepclouds_runtime.volume_scene import options_from, volume_scene
 
 # How a render is done, whatever the input.
-RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection")
+RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection", "extrapolate")
 _MOST_THREADS = 1024
 SCENE_OPTIONS = ("sensor", "max_depth", "hide_emitters")
 
@@ -51,7 +51,8 @@ def load(
         name of the grid in a .vdb file; set negative values and NaN to 0.
     **options
         for a volume: the fields of `deepclouds_runtime.volume_scene.VolumeOptions`; for a scene: ``sensor``, ``max_depth``,
-        ``hide_emitters``; for both: ``multiple``, ``environment_directions``, ``interreflection`` (see `Renderer`).
+        ``hide_emitters``; for both: ``mode``, ``multiple``, ``environment_directions``, ``interreflection``, ``extrapolate`` (see
+        `Renderer`).
 
     Returns
     -------

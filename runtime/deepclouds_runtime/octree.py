@@ -108,6 +108,8 @@ class Octree:
         no more points are asked for once there are so many.
     levels
         most levels of refinement.
+    carried
+        so many of the fields, the last ones, are known at the nodes that the others ask for: they refine nothing.
 
     Attributes
     ----------
@@ -124,6 +126,7 @@ class Octree:
         tolerance: float,
         budget: int,
         levels: int,
+        carried: int = 0,
     ) -> None:
         self.lattice = lattice
         self.statistics = Statistics()
@@ -138,7 +141,8 @@ class Octree:
         cells, member = np.unique(index, return_inverse=True)
         coordinates = np.stack([cells % nx, cells // nx % ny, cells // (nx * ny)], axis=1)
         values = self._corner_values(coordinates, 0)
-        self.fields = values.shape[2]
+        # Fields that decide what is refined.
+        self.fields = values.shape[2] - carried
         leaves = [self._roots(coordinates, values)]
         leaves[0][cells] = values
         # An entry of the table is the number of a leaf, or less than 0: where the eight entries of the children begin.
@@ -168,9 +172,9 @@ class Octree:
             child = (local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[member]
             member = 8 * member + child @ (1, 2, 4)
             coordinates = (2 * parents[:, None] + _CORNERS).reshape(-1, 3)
-            continued = np.einsum("oci,pik->pock", _CHILD_WEIGHTS, before).reshape(8 * blocks, 8, self.fields)
+            continued = np.einsum("oci,pik->pock", _CHILD_WEIGHTS, before[..., : self.fields]).reshape(8 * blocks, 8, self.fields)
             values = self._corner_values(coordinates, level + 1)
-            known_error = np.sqrt(np.square(values - continued).max(axis=2).mean(axis=1) * (8 / 7)) / _GAIN
+            known_error = np.sqrt(np.square(values[..., : self.fields] - continued).max(axis=2).mean(axis=1) * (8 / 7)) / _GAIN
             # Every split cell gets a block of eight leaves, and of eight entries of the table that its own now points at.
             table[slots[split]] = -len(table) - 8 * np.arange(blocks)
             slots = len(table) + np.arange(8 * blocks)
@@ -185,7 +189,9 @@ class Octree:
     def _scale(self, local: Array, member: Array, weights: Array, values: Array, coordinates: Array, level: int) -> float:
         """Mean value over the points, of the largest field."""
         fraction = local * 2.0**level - coordinates[member]
-        mean = np.einsum("pc,pck->pk", _trilinear(fraction), values[member]).T @ weights / max(float(weights.sum()), 1e-30)
+        mean = (
+            np.einsum("pc,pck->pk", _trilinear(fraction), values[member][..., : self.fields]).T @ weights / max(float(weights.sum()), 1e-30)
+        )
         return float(mean.max(initial=0.0))
 
     def _corner_values(self, coordinates: Array, level: int) -> Array:
@@ -234,9 +240,10 @@ class Octree:
         result: Array = grid[all_corners[..., 2], all_corners[..., 1], all_corners[..., 0]]
         return result
 
-    def upload(self, types: Any) -> DeviceOctree:
-        """The same on the device, for lookups in kernels."""
-        return DeviceOctree(types, self.lattice, self._table, self._leaves)
+    def upload(self, types: Any, carried: bool = False) -> DeviceOctree:
+        """The same on the device, for lookups in kernels: the fields that were asked for, or those that were `carried` along."""
+        leaves = self._leaves[..., self.fields :] if carried else self._leaves[..., : self.fields]
+        return DeviceOctree(types, self.lattice, self._table, leaves)
 
 
 class DeviceOctree:

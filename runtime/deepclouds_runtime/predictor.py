@@ -119,8 +119,8 @@ class Predictor:
         albedos
             single-scattering albedos.
         size
-            longest side of the cloud's box in mean free paths, see `deepclouds.volume.pyramid.optical_size`; None leaves it out, and so does
-            a model that does not say what sizes it knows.
+            longest side of the cloud's box in mean free paths, see `deepclouds.volume.pyramid.optical_size`; None leaves it out, and so
+            does a model that does not say what sizes it knows.
         """
         found: dict[str, str] = {}
         lobes = ordered_lobes(phase)

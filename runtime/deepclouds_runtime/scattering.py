@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -65,17 +66,43 @@ class NetworkScattering:
         self.descriptor = Descriptor(field, unit, origin)
         self.predictor = predictor
         self._types = field.types
+        trusted = getattr(getattr(predictor, "metadata", None), "trust", None) is not None
+        self._errors: Callable[..., NDArray[np.float32]] | None = getattr(predictor, "errors", None) if trusted else None
 
     def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
         """J of the points; see `MultipleScattering`."""
+        return self._asked(points, w, omega_sun, phase, albedos, tau, None)[0]
+
+    def with_errors(
+        self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """J of the points, and the error to expect of each, both (n, albedos); only where `knows_errors`."""
+        return self._asked(points, w, omega_sun, phase, albedos, tau, self._errors)
+
+    @property
+    def knows_errors(self) -> bool:
+        """Whether the network's file says how far its predictions can be trusted."""
+        return self._errors is not None
+
+    def _asked(
+        self,
+        points: Any,
+        w: Any,
+        omega_sun: Any,
+        phase: Phase,
+        albedos: tuple[float, ...],
+        tau: Any,
+        errors: Callable[..., NDArray[np.float32]] | None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         # The arc cosine of a float32 cosine loses half of its digits near 0 and pi; the cross product keeps them.
         gamma = np.array(dr.atan2(dr.norm(dr.cross(w, omega_sun)), dr.dot(w, omega_sun)))
         depth = np.array(tau)
         n = len(gamma)
         result = np.empty((n, len(albedos)), np.float32)
+        expected = np.zeros((n, len(albedos)), np.float32)
         if self.descriptor.empty:
             result[:] = 0
-            return result
+            return result, expected
         stencils = np.empty((min(n, _CHUNK), LEVELS, POINTS), np.float32)
         for start in range(0, n, _CHUNK):
             stop = min(start + _CHUNK, n)
@@ -85,8 +112,10 @@ class NetworkScattering:
                 stencil[:, k] = level.numpy().reshape(-1, POINTS)
             for m, albedo in enumerate(albedos):
                 aux = aux_inputs(gamma[start:stop], *ordered_lobes(phase), albedo, depth[start:stop])
-                result[start:stop, m] = self.predictor.predict(stencil, aux)
-        return result
+                result[start:stop, m] = j = self.predictor.predict(stencil, aux)
+                if errors is not None:
+                    expected[start:stop, m] = errors(stencil, aux, j)
+        return result, expected
 
 
 class WalkScattering:
