@@ -69,6 +69,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=_seed, default=0, help="of all random numbers (default %(default)s)")
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with deepclouds)")
     parser.add_argument(
+        "--extrapolate", action="store_true", help="ask the network about media it was not trained on, in place of tracing paths there"
+    )
+    parser.add_argument(
         "--max-depth", type=int, help="-1 for all orders of scattering, 2 for single scattering alone (default: the scene's)"
     )
     parser.add_argument("--hide-emitters", action="store_true", default=None, help="black behind the cloud in place of the sky")
@@ -129,6 +132,8 @@ def run(argv: Sequence[str], prog: str) -> int:
     if arguments.clamp:
         options["clamp"] = True
     how: dict[str, Any] = {"mode": arguments.mode, "multiple": arguments.multiple, "interreflection": not arguments.no_interreflection}
+    if arguments.extrapolate:
+        how["extrapolate"] = True
     if arguments.env_directions is not None:
         how["environment_directions"] = arguments.env_directions
 
@@ -183,6 +188,9 @@ def run(argv: Sequence[str], prog: str) -> int:
     }
     save(result, output, settings, png, arguments.exposure)
     _report(result, say)
+    for note in result.notes:
+        if note not in renderer.notes:
+            say(f"warning: {note}")
     say(f"wrote {output}" + (f" and {png}" if png is not None else ""))
     return 0
 
@@ -228,6 +236,8 @@ def _report(result: RenderResult, say: Callable[[str], None]) -> None:
     rows = [("mode", statistics.mode), ("samples a pixel", f"up to {statistics.spp:,}, on average {statistics.mean_spp:.3g}")]
     if statistics.noise is not None:
         rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
+    if statistics.network:
+        rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
     for name, source in statistics.sources.items():
         took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
         rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))

@@ -11,6 +11,7 @@
 | mode | string | `fast` (default), or `reference`: every sample asks the network |
 | error | float | of the fast mode without a number of samples: noise of a pixel to aim at over the mean (default 0.02) |
 | multiple | string | `network` (default), or `walks`: Monte Carlo in place of the network, for tests and references |
+| extrapolate | boolean | ask the network about media that it was not trained on, in place of walks there (default false) |
 
 The plugin exists in Python, after ``import deepclouds_runtime``, in the variants ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_rgb`` and
 ``cuda_ad_mono``; Mitsuba's own command line is a C++ program that does not see it. It renders whole images only: there are no gradients,
@@ -71,6 +72,7 @@ def _integrator_class(mi: Any) -> Any:
             self.mode = str(properties.get("mode", "fast"))
             self.error = float(properties.get("error", 0.02))
             self.multiple = str(properties.get("multiple", "network"))
+            self.extrapolate = bool(properties.get("extrapolate", False))
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
             """Render through the film: a tensor (h, w, channels of the film's pixel format), empty unless `develop`."""
@@ -88,6 +90,7 @@ def _integrator_class(mi: Any) -> Any:
                 environment_directions=self.environment_directions,
                 interreflection=self.interreflection,
                 mode=self.mode,
+                extrapolate=self.extrapolate,
                 load_seconds=time.perf_counter() - started,
             )
             result = renderer.render(spp if spp > 0 else None, int(np.ravel(np.array(seed))[0]), error=self.error)

@@ -19,6 +19,7 @@ from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
 from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.camera import Camera
+from deepclouds_runtime.confidence import confidence, doubtful, relative_errors, warning
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
 from deepclouds_runtime.lights import Environment, Shade, environment, mitsuba_radiance
@@ -83,6 +84,9 @@ class Statistics:
         cells level by level, and ``error`` of the interpolation at a point, measured.
     skipped
         reason -> queries that were not needed.
+    network
+        where the network knows its errors: ``error`` to expect of the cloud's light, and ``doubtful``, the share of that light in pixels of
+        low confidence.
     """
 
     mode: str
@@ -91,6 +95,7 @@ class Statistics:
     noise: float | None = None
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
+    network: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -105,7 +110,8 @@ class RenderResult:
         (h, w) share of each pixel that shows cloud, surface or a visible environment.
     channels
         name -> (h, w): ``R, G, B, A``; ``volume_direct.*``, ``volume_indirect.*``, ``surface.*`` and ``background.*``, whose sum is
-        the image; ``volume_opacity``; ``volume_Z``, the mean distance from the camera of what hides, world units, 0 without cloud.
+        the image; ``volume_opacity``; ``volume_Z``, the mean distance from the camera of what hides, world units, 0 without cloud;
+        ``confidence``, 1 less the network's error to expect as a share of the pixel, in the fast mode where the model knows its errors.
     seconds
         stage -> seconds; ``load`` is what was done once, ``total`` all the rest.
     counts
@@ -146,6 +152,8 @@ class Renderer:
     mode
         ``"fast"``: J is predicted at a sparse set of points and interpolated, samples are spent until the noise is as asked; or
         ``"reference"``: the method as published, where every sample asks the network.
+    extrapolate
+        whether the network is asked about media that it was not trained on; by default J then comes from walks.
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
@@ -153,6 +161,8 @@ class Renderer:
     ----------
     notes
         what was approximated in reading the scene, and what of its medium the model was not trained on, in sentences.
+    model_hash
+        of the weights that are asked, or None.
 
     Raises
     ------
@@ -169,6 +179,7 @@ class Renderer:
         environment_directions: int = 2,
         interreflection: bool = True,
         mode: str = "fast",
+        extrapolate: bool = False,
         load_seconds: float = 0.0,
     ) -> None:
         if mode not in MODES:
@@ -191,10 +202,14 @@ class Renderer:
         # Single scattering alone stops before light that surfaces have reflected, as volpath with max_depth 2 does.
         self._interreflection = interreflection and scene.surfaces is not None and scene.max_depth != 2
         self.notes = scene.notes
-        outside = getattr(predictor, "outside", None)
-        if self._network is not None and outside is not None and (unknown := outside(scene.phase, scene.albedo)):
-            self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is extrapolated",)
-        self.model_hash: str | None = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
+        if self._network is not None and (unknown := _unknown(self._network, predictor, scene)):
+            instead = "extrapolated" if extrapolate else "path-traced in place of it, noisy and slow ('extrapolate' asks it all the same)"
+            self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
+            if not extrapolate:
+                self._network, self._multiple = None, "walks"
+        self.model_hash: str | None = None
+        if self._network is not None:
+            self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
 
     def samples(self, spp: int | None) -> int:
@@ -272,7 +287,11 @@ class Renderer:
             if source is not None:
                 statistics.sources[name] = source.summary()
         statistics.skipped = work.skipped()
-        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, statistics, self.notes)
+        notes = self.notes
+        if "confidence" in channels:
+            statistics.network = doubtful(channels["confidence"], channels)
+            notes += tuple(filter(None, [warning(statistics.network)]))
+        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, statistics, notes)
 
     def _lights(self) -> Lights:
         """The lights, with the tables that depend on them: made anew for each render."""
@@ -302,6 +321,7 @@ class _Work:
     sources: list[FrameSource] | None = None
     named: dict[str, FrameSource] = field(default_factory=dict)
     all_round: AllRound | None = None
+    errors: Image | None = None
 
     def __post_init__(self) -> None:
         width, height = self.scene.size
@@ -396,6 +416,7 @@ class _Work:
         }
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
+        self.errors = relative_errors(self.sources, seen, np.array(pixel), self.scene.size)
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
 
@@ -555,4 +576,16 @@ class _Work:
         channels["A"] = np.minimum(alpha, 1)
         channels["volume_opacity"] = opacity
         channels["volume_Z"] = np.where(opacity > 0, depth / np.where(opacity > 0, opacity, 1), 0).astype(np.float32)
+        if self.errors is not None:
+            channels["confidence"] = confidence(self.errors, channels)
         return channels
+
+
+def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene) -> list[str]:
+    """What of the scene's medium the model was not trained on, in words."""
+    outside = getattr(predictor, "outside", None)
+    if outside is None or network.descriptor.empty:
+        return []
+    longest = float(np.linalg.norm(scene.volume.to_world[:3, :3], axis=0).max())
+    found: list[str] = outside(scene.phase, scene.albedo, longest / network.descriptor.unit)
+    return found

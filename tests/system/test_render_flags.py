@@ -54,7 +54,7 @@ KEEPING = {
     "--multiple": ["walks"],
 }
 # Not for a volume, or a choice of the network, which has tests of its own.
-ELSEWHERE = {"--output", "--sensor", "--model", "--help", "-D", "--mode", "--error"}
+ELSEWHERE = {"--output", "--sensor", "--model", "--help", "-D", "--mode", "--error", "--extrapolate"}
 
 
 @pytest.fixture(autouse=True)
