@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from deepclouds_training.network import FEATURES, ORDERS, AngleFeatures, Network, NetworkConfig
+from pydantic import ValidationError
 
 from deepclouds.medium.phase import hg_numpy
 from deepclouds.model import LEVELS, POINTS, aux_inputs
@@ -142,3 +143,19 @@ def test_folded_network_is_the_same_function() -> None:
     net = network()
     net.fit_inputs(stencil.numpy(), np.ones(64, np.float32))
     torch.testing.assert_close(net.folded()(stencil, aux), net(stencil, aux), rtol=1e-5, atol=0)
+
+
+def test_levels_without_a_block_are_not_read() -> None:
+    stencil, aux = random_inputs(8)
+    net = network(NetworkConfig(width=16, levels=(0, 3, 9)))
+    assert len(net.blocks) == 3
+    for k in range(LEVELS):
+        changed = stencil.clone()
+        changed[:, k] *= 3
+        assert torch.equal(net(changed, aux), net(stencil, aux)) == (k not in (0, 3, 9)), f"level {k}"
+
+
+@pytest.mark.parametrize("levels", [(), (0, 0, 1), (3, 1), (-1, 2), (0, LEVELS)])
+def test_levels_that_do_not_ascend_or_exist_are_refused(levels: tuple[int, ...]) -> None:
+    with pytest.raises(ValidationError, match="ascending"):
+        NetworkConfig(levels=levels)

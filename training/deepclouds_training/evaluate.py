@@ -98,11 +98,12 @@ def predict_labels(model: Path, data: Path, backend: Literal["llvm", "cuda"] = "
     parts = []
     for info in shards:
         samples, size = source.all_of(info)
-        parts.append(_labels(samples, _predict(session, samples), info.index, info.family, size))
+        parts.append(labels_of(samples, _predict(session, samples), info.index, info.family, size))
     return Labels(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in vars(parts[0])})
 
 
-def _labels(samples: Samples, prediction: Floats, cloud: int, family: str, size: float) -> Labels:
+def labels_of(samples: Samples, prediction: Floats, cloud: int, family: str, size: float) -> Labels:
+    """Predictions (n,) beside the samples of one cloud: its number, its family and its longest side in units of length."""
     n = len(samples)
     gamma, g1, g2, weight, albedo, log1p_tau = (samples.aux[:, i].astype(np.float64) for i in range(6))
     half = samples.half.astype(np.float64)

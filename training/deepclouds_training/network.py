@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -43,6 +44,8 @@ class NetworkConfig(BaseModel):
         stencil value itself.
     compression
         ``log``, log(1 + v), or ``root``, the fourth root of v + 0.05, which onnxruntime evaluates several times faster.
+    levels
+        the levels that have a block, ascending from 0, the finest; the others are not read.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -51,6 +54,14 @@ class NetworkConfig(BaseModel):
     order: Literal["coarse_first", "fine_first"] = "coarse_first"
     scale: Literal["depth", "density"] = "depth"
     compression: Literal["log", "root"] = "log"
+    levels: tuple[int, ...] = tuple(range(LEVELS))
+
+    @field_validator("levels")
+    @classmethod
+    def _ascending(cls, levels: tuple[int, ...]) -> tuple[int, ...]:
+        if not levels or list(levels) != sorted(set(levels) & set(range(LEVELS))):
+            raise ValueError(f"levels are different, ascending numbers from 0 to {LEVELS - 1}, at least one of them")
+        return levels
 
 
 class AngleFeatures(nn.Module):
@@ -151,14 +162,14 @@ class Network(nn.Module):
         super().__init__()
         self.config = config
         self.angle = AngleFeatures()
-        self.blocks = nn.ModuleList(Block(config.width, first=i == 0) for i in range(LEVELS))
+        self.blocks = nn.ModuleList(Block(config.width, first=i == 0) for i in range(len(config.levels)))
         self.fc_1 = nn.Linear(config.width + FEATURES, config.width)
         self.fc_2 = nn.Linear(config.width + FEATURES, config.width)
         self.head = nn.Linear(config.width, 1)
         self.register_buffer("level_mean", torch.zeros(LEVELS))
         self.register_buffer("level_scale", torch.ones(LEVELS))
         # Levels in the order in which the blocks read them.
-        self.sequence = list(range(LEVELS))[:: -1 if config.order == "coarse_first" else 1]
+        self.sequence = list(config.levels)[:: -1 if config.order == "coarse_first" else 1]
         self.is_folded = False
         self._initialise()
 
@@ -224,22 +235,34 @@ class Network(nn.Module):
     def hidden(self, stencil: Tensor, aux: Tensor) -> Tensor:
         """All layers but the last, (n, width): what training may compute in half precision."""
         levels = torch.unbind(stencil, dim=1)
-        f = self.angle(aux)
+        # Level by level, so that what is compressed is still in the cache when it is multiplied.
+        return self.through(lambda k: self.compressed(levels[k], k), self.angle(aux), self.is_folded)
+
+    def through(self, level: Callable[[int], Tensor], f: Tensor, plain: bool) -> Tensor:
+        """All layers but the last, from what `level` gives for level k, (n, 225), and the features `f`.
+
+        With `plain` the weights take it as it is: it is standardised already, or they are `folded`.
+        """
         o: Tensor | None = None
         for k, block in zip(self.sequence, self.blocks, strict=True):
-            # Level by level, so that what is compressed is still in the cache when it is multiplied.
             assert isinstance(block, Block)
-            plain: tuple[Tensor, Tensor] = (block.stencil.weight, block.stencil.bias)
-            weight, bias = plain if self.is_folded else block.standardised(self.level_mean[k], self.level_scale[k])
-            o = block(self.compressed(levels[k], k), weight, bias, f, o)
+            own: tuple[Tensor, Tensor] = (block.stencil.weight, block.stencil.bias)
+            weight, bias = own if plain else block.standardised(self.level_mean[k], self.level_scale[k])
+            o = block(level(k), weight, bias, f, o)
         assert o is not None
+        return self.finish(o, f)
+
+    def finish(self, o: Tensor, f: Tensor) -> Tensor:
+        """The two layers between the last block and the head."""
         h: Tensor = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
-        h = F.relu(self.fc_2(torch.cat([h, f], dim=1)))
-        return h
+        return F.relu(self.fc_2(torch.cat([h, f], dim=1)))
 
     def leave(self, hidden: Tensor) -> Tensor:
         """The last layer: j (n,), an exponential, whose argument needs all digits."""
-        return torch.exp(torch.clamp(self.head(hidden).squeeze(1), LOWEST, HIGHEST))
+        return self._exponential(self.head(hidden))
+
+    def _exponential(self, argument: Tensor) -> Tensor:
+        return torch.exp(torch.clamp(argument.squeeze(1), LOWEST, HIGHEST))
 
 
 def _powers(value: Tensor, one: Tensor) -> Tensor:

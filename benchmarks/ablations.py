@@ -1,0 +1,99 @@
+"""Ablations of the radiance-predicting network: `python -m benchmarks.ablations` trains all variants side by side and judges them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from deepclouds_training.network import Network, NetworkConfig
+
+from benchmarks.ablation_page import PICTURE, body, draw
+from benchmarks.ablation_results import figures, held_out, multiply_adds, predictions, query_seconds, weights
+from benchmarks.ablation_training import BATCH, Learner, Plan, Race
+from benchmarks.ablation_variants import BASE, VARIANTS
+from benchmarks.page import write_results
+from deepclouds.errors import InputError
+from deepclouds.replacing import replacing
+
+log = logging.getLogger(__name__)
+PAGE = Path("docs/ablations.md")
+HELD_OUT = (Path("work/valid_converged"), Path("work/valid_halves"))
+RESULTS = "results.json"
+LARGE = NetworkConfig(width=192, compression="root")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train, judge, write; a run that was interrupted goes on."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ablations", description=__doc__)
+    parser.add_argument("--data", type=Path, default=Path("work/labels"))
+    parser.add_argument("--minutes", type=float, default=35.0, help="of training, all networks together")
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--only", nargs="+", choices=[v.name for v in VARIANTS], help="these variants alone")
+    parser.add_argument("--shards", type=int, default=Plan.shards, help="shards of a pool")
+    parser.add_argument("-o", "--output", type=Path, default=Path("work/ablations"))
+    parser.add_argument("--docs", action="store_true", help=f"write {RESULTS} of the output folder into {PAGE}, without training")
+    options = parser.parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    path = options.output / RESULTS
+    if options.docs:
+        if not path.exists():
+            raise InputError(f"{path}: no results yet; run without --docs first")
+        results = json.loads(path.read_text())
+        draw(results, PAGE.parent / PICTURE)
+        write_results(PAGE, "ablations", body(results))
+        return 0
+    plan = Plan(options.data, options.minutes, shards=options.shards)
+    chosen = [v for v in VARIANTS if options.only is None or v.name in options.only]
+    learners = [Learner(v, seed, plan) for v in chosen for seed in range(options.seeds)]
+    race = Race(plan, learners, options.output)
+    race.run()
+    results = _judged(race)
+    with replacing(path, ".json") as temporary:
+        temporary.write_text(json.dumps(results, indent=1))
+    print(body(results))
+    return 0
+
+
+def _judged(race: Race) -> dict[str, Any]:
+    assert race.readings is not None
+    torch.set_num_threads(race.plan.threads)
+    averaged = {learner.key: learner.average.averaged(learner.network).eval() for learner in race.learners}
+    converged, halves = (predictions(averaged, race.readings, held_out(folder)) for folder in HELD_OUT)
+    log.info("measuring the cost of a query")
+    first = {learner.variant.name: averaged[learner.key] for learner in race.learners if learner.seed == 0}
+    seconds = query_seconds({**first, "large": Network(LARGE)})
+    rows = []
+    for variant in dict.fromkeys(learner.variant for learner in race.learners):
+        mine = [learner for learner in race.learners if learner.variant == variant]
+        network = first[variant.name]
+        rows.append(
+            {
+                "name": variant.name,
+                "group": variant.group,
+                "what": variant.what,
+                "weights": weights(network),
+                "multiply_adds": multiply_adds(network),
+                "seconds": seconds[variant.name][0],
+                "batch": seconds[variant.name][1],
+                "training_seconds": sum(learner.seconds for learner in mine) / len(mine),
+                "seeds": [figures(converged[learner.key], halves[learner.key]) for learner in mine],
+            }
+        )
+    return {
+        "commit": subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout.strip(),
+        "samples": race.step * BATCH,
+        "minutes": race.elapsed / 60,
+        "base": BASE,
+        "large": {"weights": weights(Network(LARGE)), "multiply_adds": multiply_adds(Network(LARGE)), "seconds": seconds["large"][0]},
+        "rows": rows,
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
