@@ -6,6 +6,7 @@ SCENES ?=
 TESTS ?=
 MODEL ?=
 LABELS ?=
+CARD ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,7 +24,7 @@ NATIVE := CMakeLists.txt $(wildcard deepclouds/volume/native/*)
 .NOTPARALLEL:
 .SILENT:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-reference test check accuracy bench bench-labels labels train-model setup setup-test setup-bench setup-train clean
+.PHONY: help demo demo-reference test check accuracy card bench bench-labels labels train-model setup setup-test setup-bench setup-train clean
 
 help:
 	echo "make demo            render the demo cloud"
@@ -32,6 +33,7 @@ help:
 	echo "make check           style and types"
 	echo "make bench           run time against error (SCENES=folder for other scenes)"
 	echo "make accuracy        how far images, furnace, slabs, held-out labels and hard cases are from the truth"
+	echo "make card            the page about the released models, from their metadata and docs/figures"
 	echo "make bench-labels    cost of training labels beside Mitsuba's volpath"
 	echo "make labels          the labels to train on and those to judge by; run again after an interruption, it goes on"
 	echo "make train-model     labels, training and export of the model; run again after an interruption, it goes on"
@@ -79,7 +81,11 @@ labels: setup-train
 
 # LABELS names folders of held-out labels, as `make labels` makes them.
 accuracy: setup-test
-	$(BIN)/python -m benchmarks.accuracy $(if $(SCENES),--scenes $(SCENES)) $(if $(MODEL),--model $(MODEL)) $(foreach folder,$(LABELS),--labels $(folder))
+	$(BIN)/python -m benchmarks.accuracy $(if $(SCENES),--scenes $(SCENES)) $(if $(MODEL),--model $(MODEL)) $(if $(CARD),--card) $(foreach folder,$(LABELS),--labels $(folder))
+
+# Of the released models, with the figures that `make accuracy MODEL=NAME CARD=1` keeps in docs/figures.
+card: setup
+	$(BIN)/deepclouds card first wide --figures docs/figures -o docs/model_card.md
 
 bench-labels: setup-test
 	$(BIN)/python -m benchmarks.labels

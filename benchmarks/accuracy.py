@@ -18,6 +18,8 @@ from pathlib import Path
 from deepclouds_runtime.predictor import Predictor
 
 from benchmarks import accuracy_slabs, accuracy_special
+from benchmarks.accuracy_card import as_typed, keep, write_figures
+from benchmarks.accuracy_confidence import ConfidenceResult, measure_confidence, rise
 from benchmarks.accuracy_figures import Row
 from benchmarks.accuracy_furnace import CLOUDS, FurnaceCloud, furnace_rows, measure_furnace
 from benchmarks.accuracy_labels import LabelsResult, measure_labels
@@ -37,6 +39,7 @@ _TITLES = {
     "slabs": "Slabs",
     "labels": "Held-out labels",
     "special": "Special cases",
+    "confidence": "Confidence",
 }
 _SPECIAL_SEED = 9200
 
@@ -77,6 +80,7 @@ class Results:
     slabs: list[SlabResult]
     labels: list[LabelsResult]
     special: list[CaseResult]
+    confidence: list[ConfidenceResult]
 
     @property
     def rows(self) -> list[Row]:
@@ -87,6 +91,7 @@ class Results:
             *slab_rows(self.slabs),
             *(row for result in self.labels for row in result.rows),
             *(c.row for c in self.special),
+            *(row for result in self.confidence for row in result.rows),
         ]
 
     @property
@@ -110,6 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"), help="folder for table and pictures (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="very little of everything: a check that it runs, not a measurement")
     parser.add_argument("--docs", action="store_true", help="also write docs/accuracy.md and docs/images/accuracy_*.png")
+    parser.add_argument("--card", action="store_true", help="also keep figures and pictures for `make card`")
     options = parser.parse_args(argv)
     folders = find_scenes(options.scenes, options.only)
     predictor = Predictor(options.model)
@@ -120,7 +126,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     body = f"Measured on: {machine()}\n\nModel `{predictor.path.name}`, weights {predictor.metadata.initialisers_sha256[:12]}.\n\n"
     body += f"`{results.headline}`\n\n{markdown(results)}"
-    pictures = write_pictures(options.out, results.scenes, results.furnace, results.slabs, results.labels, results.special)
+    parts = results.scenes, results.furnace, results.slabs, results.labels, results.special, results.confidence
+    pictures = write_pictures(options.out, *parts)
+    figures = options.out / "accuracy.json"
+    write_figures(figures, predictor, as_typed(argv), machine(), results.headline, results.rows)
+    kept = keep(figures, pictures, predictor.path.stem) if options.card else []
     with replacing(options.out / "accuracy.md", ".md") as temporary:
         temporary.write_text(f"{body}\n", encoding="utf-8")
     if options.docs:
@@ -131,7 +141,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print()
     for row in results.rows:
         print(row.line)
-    print(f"wrote {options.out}/accuracy.md and {len(pictures)} pictures" + (", docs/accuracy.md" if options.docs else ""))
+    also = (["docs/accuracy.md"] if options.docs else []) + [str(path.relative_to(ROOT)) for path in kept]
+    print(f"wrote {', '.join([f'{options.out}/accuracy.md, {figures.name} and {len(pictures)} pictures', *also])}")
     print(results.headline)
     return 0
 
@@ -143,7 +154,7 @@ def measure(folders: Sequence[Path], predictor: Predictor, size: Size, labels: S
     def say(text: str) -> None:
         print(f"{time.perf_counter() - started:5.0f} s  {text}", flush=True)
 
-    results = Results([], [], [], [], [])
+    results = Results([], [], [], [], [], [])
     for folder in folders:
         results.scenes.append(measure_scene(folder, predictor, size.spp))
         say(results.scenes[-1].row.line)
@@ -154,6 +165,12 @@ def measure(folders: Sequence[Path], predictor: Predictor, size: Size, labels: S
     for folder in labels:
         results.labels.append(measure_labels(folder, predictor.path))
         say(results.labels[-1].rows[0].line)
+        if (confidence := measure_confidence(folder, predictor)) is not None:
+            results.confidence.append(confidence)
+            by = {"expected error": rise(confidence.by_expected), "distance": rise(confidence.by_distance)}
+            say(
+                f"{confidence.name}: error in the last two tenths over the first two " + ", ".join(f"{v:.2f} by {k}" for k, v in by.items())
+            )
     for number, case in enumerate(accuracy_special.cases()):
         results.special.append(measure_case(case, predictor, size.points, size.walks, _SPECIAL_SEED + number))
         say(results.special[-1].row.line)

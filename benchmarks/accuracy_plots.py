@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.accuracy_confidence import ConfidenceResult
 from benchmarks.accuracy_furnace import ASYMMETRIES, FurnaceCloud
 from benchmarks.accuracy_labels import LabelsResult
 from benchmarks.accuracy_scenes import SceneResult
@@ -27,11 +28,14 @@ def write_pictures(
     slabs: Sequence[SlabResult],
     labels: Sequence[LabelsResult],
     special: Sequence[CaseResult],
+    confidence: Sequence[ConfidenceResult] = (),
 ) -> list[Path]:
     """Write `accuracy_*.png` into `folder`; returns the files, none without matplotlib."""
     if find_spec("matplotlib") is None:
         return []
     drawn = {"scenes": _scenes(scenes), "furnace": _furnace(furnace), "slabs": _slabs(slabs), "special": _special(special)}
+    if confidence:
+        drawn["confidence"] = _confidence(confidence, special)
     written = []
     for name, figure in drawn.items():
         written.append(folder / f"accuracy_{name}.png")
@@ -136,4 +140,35 @@ def _special(cases: Sequence[CaseResult]) -> Any:
         for ticks in (axis.xaxis, axis.yaxis):
             ticks.set_minor_formatter(NullFormatter())
     axes[0].set_ylabel("j, predicted")
+    return figure
+
+
+def _confidence(results: Sequence[ConfidenceResult], special: Sequence[CaseResult]) -> Any:
+    figure = _figure(9, 4)
+    axes = figure.subplots(1, 2, sharey=True)
+    for result, colour in zip(results, _COLOURS, strict=False):
+        for axis, tenths, x in (
+            (axes[0], result.by_expected, [100 * d.expected for d in result.by_expected]),
+            (axes[1], result.by_distance, [d.distance for d in result.by_distance]),
+        ):
+            value, low, high = (100 * np.array([getattr(d.found, end) for d in tenths]) for end in ("value", "low", "high"))
+            axis.errorbar(x, value, [value - low, high - value], fmt="o-", markersize=4, lw=0.8, capsize=2, color=colour, label=result.name)
+    for case, marker in zip(special, "s^Dv", strict=False):
+        if case.expected is not None:
+            figures = case.row.figures
+            at, found = 100 * figures["expected"].value, 100 * figures["found"].value
+            axes[0].plot([at], [found], marker, color="#444444", markersize=6, label=case.name)
+    ends = [4, 100]
+    axes[0].plot(ends, ends, color="#888888", lw=0.8)
+    axes[0].set(
+        xscale="log", yscale="log", xlabel="expected error, %", ylabel="error found, % of j + 0.05", title="tenths by expected error"
+    )
+    axes[1].set(xscale="log", xlabel="distance from the training data", title="tenths by distance alone")
+    ticks = [5, 10, 20, 50, 100]
+    axes[0].set(xticks=ticks, xticklabels=ticks, yticks=ticks, yticklabels=ticks, xlim=ends, ylim=ends)
+    distances = [0.5, 1, 2, 4]
+    axes[1].set(xticks=distances, xticklabels=distances)
+    for axis in axes:
+        axis.minorticks_off()
+    axes[0].legend(frameon=False, fontsize=7)
     return figure

@@ -17,11 +17,12 @@ from deepclouds_training.points import around, random_lines
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from benchmarks.accuracy_figures import Row, noise_free
+from benchmarks.accuracy_figures import Figure, Row, bootstrap, noise_free
 from deepclouds.backend import backend
 from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
 from deepclouds.medium.multiple_scattering import trace_walks
+from deepclouds.model.trust import FLOOR
 from deepclouds.volume import Volume
 from deepclouds.volume.pyramid import mean_extinction
 
@@ -57,17 +58,21 @@ class Case:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """j = 4 pi J / E at n points, as predicted and as two halves of walks, all (n,)."""
+    """j = 4 pi J / E at n points, as predicted and as two halves of walks, all (n,); and the error that the model expects, if it does."""
 
     name: str
     predicted: Floats
     half_a: Floats
     half_b: Floats
+    expected: Floats | None = None
 
     @property
     def row(self) -> Row:
         """Noise-free error and energy, intervals over the points."""
-        return Row("special", f"{self.name}, {len(self.predicted)} points", noise_free(self.predicted, self.half_a, self.half_b))
+        figures = noise_free(self.predicted, self.half_a, self.half_b)
+        if self.expected is not None:
+            figures |= relative(self.predicted, self.half_a, self.half_b, self.expected)
+        return Row("special", f"{self.name}, {len(self.predicted)} points", figures)
 
 
 def cases() -> list[Case]:
@@ -85,8 +90,36 @@ def measure_case(case: Case, predictor: Predicts, points: int, walks: int, seed:
     chosen = np.flatnonzero(hit & case.counts(hits))[:points]
     x, w = hits[chosen], directions[chosen]
     half_a, half_b = (_walked(case, field, x, w, walks // 2, stream) for stream in streams[2:])
-    j = predict(x, w, volume=case.volume, scale=case.scale, g=case.g, albedo=1.0, omega_sun=case.omega_sun, predictor=predictor)
-    return CaseResult(case.name, 4 * math.pi * j, half_a, half_b)
+    asked = _Asked(predictor)
+    j = predict(x, w, volume=case.volume, scale=case.scale, g=case.g, albedo=1.0, omega_sun=case.omega_sun, predictor=asked)
+    return CaseResult(case.name, 4 * math.pi * j, half_a, half_b, np.concatenate(asked.errors) if asked.errors else None)
+
+
+def relative(predicted: Floats, half_a: Floats, half_b: Floats, expected: Floats) -> dict[str, Figure]:
+    """Errors in units of ``j + 0.05``, each point alike: ``expected`` by the model, and ``found``; roots of the mean square."""
+    unit = np.square(predicted + FLOOR)
+    cases = np.stack([np.square(expected) / unit, (predicted - half_a) * (predicted - half_b) / unit], axis=1)
+
+    def root_mean(v: Floats) -> Floats:
+        return np.asarray(np.sqrt(np.maximum(v.mean(axis=1), 0)))
+
+    return {name: bootstrap(column, root_mean) for name, column in zip(("expected", "found"), cases.T, strict=True)}
+
+
+class _Asked:
+    """The network, and the errors to expect of what it was asked."""
+
+    def __init__(self, predictor: Predicts) -> None:
+        self._predictor = predictor
+        self._errors = getattr(predictor, "errors", None)
+        self.errors: list[Floats] = []
+
+    def predict(self, stencil: Singles, aux: Singles) -> Singles:
+        j = self._predictor.predict(stencil, aux)
+        found = None if self._errors is None else self._errors(stencil, aux, j)
+        if found is not None:
+            self.errors.append(found.astype(np.float64))
+        return j
 
 
 def _walked(case: Case, field: Field, x: Singles, w: Singles, walks: int, seed: int) -> Floats:

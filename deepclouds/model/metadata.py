@@ -78,6 +78,8 @@ class ModelMetadata(BaseModel):
         figures of the validation, by name.
     initialisers_sha256
         `initialiser_hash` over the graph's initialisers.
+    data
+        what the training data are, in words; empty where that is not known.
     size
         smallest and largest cloud of the training data: longest side of its box in mean free paths, see
         `deepclouds.volume.pyramid.optical_size`. None where it is not known.
@@ -102,6 +104,7 @@ class ModelMetadata(BaseModel):
     dataset_hash: str
     metrics: dict[str, float]
     initialisers_sha256: str
+    data: str = ""
     size: tuple[float, float] | None = None
     trust: Trust | None = None
 

@@ -72,10 +72,16 @@ def main(argv: Sequence[str], prog: str = "deepclouds calibrate") -> int:
         raise InputError(f"shards = {options.shards}, queries = {options.queries}: at least one of each is needed")
     proto, metadata = read_model(options.model)
     data = open_dataset(options.data)
+    if data.hash != metadata.dataset_hash:
+        raise InputError(
+            f"{options.data}: has the hash {data.hash[:16]}..., {options.model} was trained on {metadata.dataset_hash[:16]}...; "
+            "give the data set that it was trained on"
+        )
     samples = training_summaries(data, options.shards, options.queries, options.backend)
     trust = calibrated(proto.SerializeToString(), samples, options.labels, options.backend)
     size = data.manifest.get("config", {}).get("size")
-    described = metadata.model_copy(update={"trust": trust, "size": None if size is None else (float(size[0]), float(size[1]))})
+    known = None if size is None else (float(size[0]), float(size[1]))
+    described = metadata.model_copy(update={"trust": trust, "size": known, "data": in_words(data)})
     target = options.output or options.model
     write_model(proto, described, target)
     quantiles = ", ".join(f"{100 * float(share):g} % {distance:.3g}" for share, distance in trust.quantiles.items())
@@ -126,6 +132,19 @@ def training_summaries(data: Dataset, shards: int, queries: int, backend: Any) -
         drawn = source.draw(info, queries, rng, config.unit_jitter ** rng.uniform(-1.0, 1.0), config.mirror)
         parts.append(summaries(drawn.stencil, drawn.aux))
     return np.concatenate(parts)
+
+
+def in_words(data: Dataset) -> str:
+    """What a data set holds, in a sentence."""
+    train, held = ([s for s in data.shards if s.split == split] for split in ("train", "valid"))
+    _, suns, albedos = data.load(train[0]).label.shape
+    points = sum(s.count for s in train)
+    text = (
+        f"{points * suns * albedos:,} labels at {points:,} points of {len(train)} clouds ({', '.join(sorted({s.family for s in train}))})"
+    )
+    if held:
+        text += f"; never trained on: {', '.join(sorted({s.family for s in held}))}"
+    return text
 
 
 def calibrated(model: bytes, training: Floats, labels: Path, backend: Any) -> Trust:
