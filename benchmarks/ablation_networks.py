@@ -109,8 +109,9 @@ class Ratio(Network):
     ``octaves``: E = 0.02 + sum over i = 1, 2, 3 of 0.5^i exp(-0.5^i tau) 4 pi p_(2^i)(gamma), p_n the phase function after n scatterings:
     the octaves of Wrenninge et al. 2013, "Oz: The Great and Volumetric" (a = b = 0.5, first octave left out because j counts multiple
     scattering alone), with exact convolutions in the place of their scaled g.
-    ``diffusion``: E = exp(-sqrt(3) s t) / (1 + 0.75 t), t = tau (1 - g), s = sqrt((1 - albedo) / (1 - albedo g)): the transmission of
-    a slab in the Eddington approximation without absorption, times diffusion's exponential decay (van de Hulst 1980, section 14.1).
+    ``diffusion``: E = exp(-min(8, sqrt(3) s t)) / (1 + 0.75 t), t = tau (1 - g), s = sqrt((1 - albedo) / (1 - albedo g)): the
+    transmission of a slab in the Eddington approximation without absorption, times diffusion's exponential decay (van de Hulst 1980,
+    section 14.1).
     """
 
     def __init__(self, config: NetworkConfig, estimate: Literal["octaves", "diffusion"]) -> None:

@@ -184,8 +184,12 @@ class Learner:
 
     def state(self) -> dict[str, Any]:
         """What `restore` takes."""
-        parts = {"network": self.network, "average": self.average, "optimiser": self.optimiser}
-        return {"seconds": self.seconds, **{name: part.state_dict() for name, part in parts.items()}}
+        return {
+            "seconds": self.seconds,
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `state`."""
