@@ -13,12 +13,13 @@ import numpy as np
 
 from deepclouds.errors import InputError
 from deepclouds.replacing import replacing
+from deepclouds_training.dataset_compare import print_comparison
 from deepclouds_training.dataset_info import print_info
 from deepclouds_training.shards import Dataset, check_shard, open_dataset, shard_file, write_manifest, write_record
 
 
 def main(argv: Sequence[str], prog: str) -> int:
-    """Run `deepclouds dataset info|verify|merge|export-stencils`."""
+    """Run `deepclouds dataset info|verify|compare|merge|export-stencils`."""
     parser = argparse.ArgumentParser(prog=prog, description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     info = verbs.add_parser("info", help="counts, ranges and noise of the labels")
@@ -29,6 +30,8 @@ def main(argv: Sequence[str], prog: str) -> int:
     merge.add_argument("-o", "--output", type=Path, required=True, help="folder of the joined data set; must not exist")
     verify = verbs.add_parser("verify", help="check every shard against the hash in its record")
     verify.add_argument("folder", type=Path)
+    compare = verbs.add_parser("compare", help="hold two independent label sets of the same points together")
+    compare.add_argument("folders", type=Path, nargs=2, metavar="DIR")
     export = verbs.add_parser("export-stencils", help="write stencils, inputs and labels as one .npz file")
     export.add_argument("folder", type=Path)
     export.add_argument("-o", "--output", type=Path, required=True, help="file to write, ending in .npz")
@@ -39,6 +42,9 @@ def main(argv: Sequence[str], prog: str) -> int:
     arguments = parser.parse_args(argv)
     if arguments.verb == "merge":
         _merge([open_dataset(folder) for folder in arguments.folders], arguments.output)
+        return 0
+    if arguments.verb == "compare":
+        print_comparison(*(open_dataset(folder) for folder in arguments.folders))
         return 0
     dataset = open_dataset(arguments.folder)
     if arguments.verb == "info":
