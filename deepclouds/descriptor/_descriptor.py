@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from deepclouds.descriptor._layout import FIRST_SPACING, LEVELS, POINTS
 from deepclouds.medium.field import Field
-from deepclouds.volume.pyramid import FilteredLevel, filtered_levels, mean_extinction, volume_frame
+from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, trilinear
+from deepclouds.volume.bricks import EDGE, Bricks
+from deepclouds.volume.pyramid import FilteredLevel, each_filtered_level, mean_extinction, volume_frame
 
 # Below this sine the plane of light and view is not defined and the given azimuth turns the stencil.
 PARALLEL_SINE = 1e-3
@@ -29,15 +31,22 @@ class _Level:
     """One filtered level on the device; what differs between levels is opaque, so that all share one kernel."""
 
     def __init__(self, types: ModuleType, level: FilteredLevel, factor: float) -> None:
-        # A rim of zeros makes the clamped lookup read zero beyond the stored cells.
-        values = np.pad(level.values, 1) * np.float32(factor)
-        nz, ny, nx = values.shape
-        self.data = types.Float(np.ascontiguousarray(values, np.float32).ravel())
+        # A rim of zeros makes the clamped lookup read zero beyond the stored cells: one cell, or one brick.
+        grid: Grid
+        if isinstance(level.values, Bricks):
+            rim = EDGE
+            nz, ny, nx = (n + 2 * rim for n in level.values.shape)
+            grid = BrickGrid(types, Bricks((nz, ny, nx), level.values.places + 1, level.values.values), float(np.float32(factor)))
+        else:
+            rim = 1
+            values = np.pad(level.values, rim) * np.float32(factor)
+            nz, ny, nx = values.shape
+            grid = DenseGrid(types, values.astype(np.float32, copy=False))
+        self.grid = grid
         self.inverse_spacing = dr.opaque(types.Float, 1.0 / level.spacing)
-        # Cell centre c sits at c + 0.5 from the origin; the rim adds one.
-        self.shift = types.Array3f(*(dr.opaque(types.Float, 0.5 - float(c)) for c in level.first))
+        # Cell centre c sits at c + 0.5 from the origin.
+        self.shift = types.Array3f(*(dr.opaque(types.Float, rim - 0.5 - float(c)) for c in level.first))
         self._last = [dr.opaque(types.Float, n - 1.0) for n in (nx, ny, nz)]
-        self._row, self._plane = dr.opaque(types.UInt32, nx), dr.opaque(types.UInt32, nx * ny)
 
     def lookup(self, types: ModuleType, cell: Any) -> Any:
         """Trilinear value at cell coordinates `cell`, where whole numbers are the stored samples."""
@@ -47,14 +56,7 @@ class _Level:
             index = dr.minimum(dr.floor(clipped), last - 1)
             low.append(types.UInt32(index))
             frac.append(clipped - index)
-        base = low[0] + low[1] * self._row + low[2] * self._plane
-        rows = []
-        for shift in (types.UInt32(0), self._row, self._plane, self._plane + self._row):
-            near = dr.gather(types.Float, self.data, base + shift)
-            rows.append(dr.fma(frac[0], dr.gather(types.Float, self.data, base + shift + 1) - near, near))
-        front = dr.fma(frac[1], rows[1] - rows[0], rows[0])
-        back = dr.fma(frac[1], rows[3] - rows[2], rows[2])
-        return dr.fma(frac[2], back - front, front)
+        return trilinear(self.grid, low, frac)
 
 
 class Descriptor:
@@ -89,11 +91,16 @@ class Descriptor:
         smallest = float(field.volume.voxel_size.min())
         spacings = [FIRST_SPACING * 2.0**k * self.unit for k in range(LEVELS)]
         self._raw_levels = sum(s <= smallest for s in spacings)
-        filtered = [] if self.empty else filtered_levels(field.volume, self._frame, spacings[self._raw_levels :])
         types = field.types
+        filtered = each_filtered_level(field.volume, self._frame, [] if self.empty else spacings[self._raw_levels :])
         self._levels = [_Level(types, level, field.scale * self.unit) for level in filtered]
         self._spacings = [dr.opaque(types.Float, s) for s in spacings]
         self._opaque_unit = dr.opaque(types.Float, self.unit)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the filtered levels."""
+        return sum(level.grid.nbytes for level in self._levels)
 
     def levels(self, points: Any, w: Any, omega_sun: Any, azimuth: Any | None = None, side: Any | None = None) -> list[Any]:
         """Stencils of n points, one Dr.Jit array of n * 225 float32 for each level, layout [point][z][y][x], finest level first.

@@ -56,7 +56,7 @@ def stencils(
                 continue
             level = filtered[k - raw]
             # A volume of the cells with a rim of zeros, in cell coordinates, reads like any other.
-            cells = np.pad(level.values, 1)
+            cells = np.pad(level.dense(), 1)
             lower = level.first - 1
             upper = lower + np.array(cells.shape[::-1])
             local = (places - frame.origin) @ frame.axes / spacing

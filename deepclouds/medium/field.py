@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, trilinear
 from deepclouds.medium.majorants import BRICK, Majorants
-from deepclouds.volume import Volume
+from deepclouds.volume import SparseVolume, Volume
 
 # Stands for an infinite distance where a difference of two must stay a number.
 _FAR = 3.0e38
@@ -27,7 +28,7 @@ class Field:
     scale
         extinction per unit of density, 1 / world length; not negative.
     brick
-        edge of a brick of `majorants`, in voxels; None for one brick, the whole box.
+        edge of a brick of `majorants`, in voxels; None for one brick, the whole box. Those of a volume in bricks are its own.
 
     Attributes
     ----------
@@ -40,7 +41,8 @@ class Field:
 
     Notes
     -----
-    Lookups are exact trilinear interpolation between cell centres in float32; outside of the box extinction is zero.
+    Lookups are exact trilinear interpolation between cell centres in float32; outside of the box extinction is zero. A `SparseVolume` stays
+    in bricks: the same values at the cost of one more gather a lookup.
     """
 
     def __init__(self, types: ModuleType, volume: Volume, scale: float = 1.0, brick: int | None = BRICK) -> None:
@@ -49,22 +51,35 @@ class Field:
         self.types = types
         self.volume = volume
         self.scale = float(scale)
-        # One sample along an axis would leave no pair to interpolate between: repeat it.
-        grid = volume.density
-        repeat = [(0, 1 if n == 1 else 0) for n in grid.shape]
-        grid = np.pad(grid, repeat, mode="edge")
-        nz, ny, nx = grid.shape
-        sigma = (grid.astype(np.float64) * scale).astype(np.float32)
-        self.majorant = float(sigma.max())
+        edges = np.linalg.norm(volume.to_world[:3, :3], axis=0)
         self.step = 0.5 * float(volume.voxel_size.min())
-        self.majorants = Majorants(types, sigma, np.linalg.norm(volume.to_world[:3, :3], axis=0) / np.array([nx, ny, nz]), brick)
-        self._data = types.Float(np.ascontiguousarray(sigma).ravel())
-        # Opaque, so that kernels compiled for one volume serve all others.
-        self._stride_y, self._stride_z = dr.opaque(types.UInt32, nx), dr.opaque(types.UInt32, nx * ny)
+        self._grid: Grid
+        if isinstance(volume, SparseVolume):
+            size = np.array(volume.resolution)
+            self.majorants = Majorants(types, volume.bricks, edges / size, brick, self.scale)
+            self._grid = BrickGrid(types, volume.bricks, self.scale)
+            # A brick holds the sample after the last one too, which a single sample along an axis is never mixed with.
+            self.majorant, last = float(self.majorants.bound.max()), np.maximum(size - 2, 0)
+        else:
+            # One sample along an axis would leave no pair to interpolate between: repeat it.
+            grid = volume.density
+            repeat = [(0, 1 if n == 1 else 0) for n in grid.shape]
+            grid = np.pad(grid, repeat, mode="edge")
+            sigma = (grid.astype(np.float64) * scale).astype(np.float32)
+            size = np.array(sigma.shape[::-1])
+            self.majorants = Majorants(types, sigma, edges / size, brick)
+            self._grid = DenseGrid(types, sigma)
+            self.majorant, last = float(sigma.max()), size - 2
         inverse = np.linalg.inv(volume.to_world)
         self._to_unit = [[dr.opaque(types.Float, float(v)) for v in row] for row in inverse[:3]]
         self._samples = [dr.opaque(types.Float, float(n)) for n in volume.resolution]
-        self._last = [dr.opaque(types.Float, float(n - 2)) for n in (nx, ny, nz)]
+        self._last = [dr.opaque(types.Float, float(n)) for n in last]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the volume, of the samples on the device, and of the majorants."""
+        volume = self.volume.bricks.nbytes if isinstance(self.volume, SparseVolume) else self.volume.density.nbytes
+        return volume + self._grid.nbytes + self.majorants.nbytes
 
     def to_unit(self, p: Any) -> Any:
         """World points to coordinates in the unit cube of the grid's box."""
@@ -94,15 +109,7 @@ class Field:
             index = dr.minimum(dr.floor(cell), last)
             low.append(t.UInt32(index))
             frac.append(cell - index)
-        base = low[0] + low[1] * self._stride_y + low[2] * self._stride_z
-        rows = []
-        for offset in (t.UInt32(0), self._stride_y, self._stride_z, self._stride_z + self._stride_y):
-            a = dr.gather(t.Float, self._data, base + offset, inside)
-            b = dr.gather(t.Float, self._data, base + (offset + 1), inside)
-            rows.append(dr.fma(frac[0], b - a, a))
-        front = dr.fma(frac[1], rows[1] - rows[0], rows[0])
-        back = dr.fma(frac[1], rows[3] - rows[2], rows[2])
-        return dr.fma(frac[2], back - front, front)
+        return trilinear(self._grid, low, frac, inside)
 
     def intersect(self, origin: Any, direction: Any) -> tuple[Any, Any]:
         """Distances at which rays enter (0 where the origin is inside) and leave the box; `leave <= enter` is a miss."""

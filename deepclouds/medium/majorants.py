@@ -13,6 +13,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.volume.bricks import EDGE, Bricks
+
 # Edge of a brick, in voxels of the smallest edge.
 BRICK = 4
 # Blocks end this far beyond their last brick, in voxels: more than float32 rounds, less than the half voxel that the bound allows.
@@ -29,11 +31,14 @@ class Majorants:
     types
         ``drjit.llvm`` or ``drjit.cuda``.
     sigma
-        (nz, ny, nx) extinction at the samples, 1 / world length.
+        (nz, ny, nx) extinction at the samples, 1 / world length, or its bricks.
     voxel_size
         (3,) edges of a voxel, x first, world units.
     brick
-        edge of a brick in voxels of the smallest edge; None for one brick that is the whole box, the readable twin.
+        edge of a brick in voxels of the smallest edge; None for one brick that is the whole box, the readable twin. Where `sigma` is in
+        bricks they serve for any other edge.
+    scale
+        factor for `sigma`.
 
     Attributes
     ----------
@@ -49,6 +54,8 @@ class Majorants:
         (bz, by, bx) the same for the largest block without extinction; -1 where the brick itself has some.
     any_empty
         whether a brick is empty.
+    nbytes
+        of all tables, those on the device included.
 
     Notes
     -----
@@ -56,19 +63,31 @@ class Majorants:
     and the inverse of the mean way out. The block of least sum is chosen. In a homogeneous or thin medium it is the whole box.
     """
 
-    def __init__(self, types: ModuleType, sigma: NDArray[np.float32], voxel_size: NDArray[np.float64], brick: int | None = BRICK) -> None:
+    def __init__(
+        self,
+        types: ModuleType,
+        sigma: NDArray[np.float32] | Bricks,
+        voxel_size: NDArray[np.float64],
+        brick: int | None = BRICK,
+        scale: float = 1.0,
+    ) -> None:
         shape = np.array(sigma.shape[::-1])
-        if brick is None:
-            self.bricks = shape
+        if isinstance(sigma, Bricks):
+            self.bricks = shape if brick is None else np.full(3, EDGE)
+            bound = sigma.window_maxima(before=True)
+            self.bound = bound.max(keepdims=True) if brick is None else bound
         else:
-            self.bricks = np.clip(np.round(brick * voxel_size.min() / voxel_size), 1, shape).astype(int)
-        self.bound = _brick_maxima(sigma, self.bricks)
+            self.bricks = shape if brick is None else np.clip(np.round(brick * voxel_size.min() / voxel_size), 1, shape).astype(int)
+            self.bound = _brick_maxima(sigma, self.bricks)
+        self.bound = (self.bound.astype(np.float64) * scale).astype(np.float32)
         self.radius, self.block_bound, self.empty_radius = _choose_blocks(self.bound, self.bricks * voxel_size)
         self.any_empty = bool(np.any(self.empty_radius >= 0))
         count = self.bound.shape[::-1]
         self._types = types
-        self._table = types.Float(np.stack([self.block_bound, self.radius], axis=-1).astype(np.float32).ravel())
+        self._table = types.Float(np.stack([self.block_bound, self.radius], axis=-1, dtype=np.float32, casting="same_kind").ravel())
         self._empty = types.Float(self.empty_radius.astype(np.float32).ravel())
+        kept = (self.bound, self.radius, self.block_bound, self.empty_radius)
+        self.nbytes = sum(a.nbytes for a in kept) + 4 * 3 * self.bound.size
         self._per_unit = [dr.opaque(types.Float, float(n / b)) for n, b in zip(shape, self.bricks, strict=True)]
         self._edge = [dr.opaque(types.Float, float(b / n)) for n, b in zip(shape, self.bricks, strict=True)]
         self._beyond = [dr.opaque(types.Float, float(_BEYOND / n)) for n in shape]
@@ -146,7 +165,7 @@ def _brick_maxima(sigma: NDArray[np.float32], bricks: NDArray[Any]) -> NDArray[n
 def _choose_blocks(bound: NDArray[np.float32], edge: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[Any]]:
     """The radius of least cost for each brick, the maximum in that block, and the largest radius that is empty."""
     mean_edge = 3 / np.sum(1 / edge)
-    radius, empty = np.zeros(bound.shape, np.int32), np.where(bound > 0, -1, 0)
+    radius, empty = np.zeros(bound.shape, np.int32), np.where(bound > 0, np.int32(-1), np.int32(0))
     best, majorant = bound + 1 / (_MEAN_EXIT * mean_edge), bound
     largest, reach = bound, 0
     while reach < max(bound.shape):

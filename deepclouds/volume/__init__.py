@@ -8,12 +8,25 @@ from typing import TYPE_CHECKING, Any
 
 from deepclouds.errors import InputError
 from deepclouds.volume._volume import Volume
+from deepclouds.volume.bricks import Bricks
+from deepclouds.volume.sparse import SparseVolume
 from deepclouds.volume.vol import read_vol, write_vol
 
 if TYPE_CHECKING:
     from deepclouds.volume.vdb import GridInfo, list_grids, read_vdb, write_vdb
 
-__all__ = ["GridInfo", "Volume", "list_grids", "read_vdb", "read_vol", "read_volume", "write_vdb", "write_vol"]
+__all__ = [
+    "Bricks",
+    "GridInfo",
+    "SparseVolume",
+    "Volume",
+    "list_grids",
+    "read_vdb",
+    "read_vol",
+    "read_volume",
+    "write_vdb",
+    "write_vol",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -35,22 +35,9 @@ class Volume:
 
     def __post_init__(self) -> None:
         density = np.ascontiguousarray(self.density, dtype=np.float32)
-        to_world = np.array(self.to_world, dtype=np.float64)
         if density.ndim != 3 or density.size == 0:
             raise InputError(f"a density grid needs three axes (z, y, x) and at least one sample, got shape {density.shape}")
-        bad = int(np.count_nonzero(~np.isfinite(density)))
-        if bad:
-            raise InputError(f"the density grid holds {bad} NaN or infinite values; clean the grid or clamp it on reading")
-        negative = int(np.count_nonzero(density < 0))
-        if negative:
-            raise InputError(f"the density grid holds {negative} negative values; clean the grid or clamp it on reading")
-        if to_world.shape != (4, 4) or not np.all(np.isfinite(to_world)) or not np.allclose(to_world[3], (0, 0, 0, 1)):
-            raise InputError("to_world must be a finite affine 4 x 4 matrix")
-        size = np.linalg.norm(to_world[:3, :3], axis=0)
-        if np.any(size == 0) or abs(np.linalg.det(to_world[:3, :3] / size)) < 1e-6:
-            raise InputError("to_world is not invertible: the grid's box has no volume")
-        density.flags.writeable = False
-        to_world.flags.writeable = False
+        density, to_world = checked(density, self.to_world)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "to_world", to_world)
 
@@ -67,6 +54,16 @@ class Volume:
         """Number of samples along x, y and z."""
         nz, ny, nx = self.density.shape
         return nx, ny, nz
+
+    @property
+    def stored(self) -> NDArray[np.float32]:
+        """Every sample that may differ from 0, as an array of three axes in any order."""
+        return self.density
+
+    def sums(self, axis: int | tuple[int, int]) -> NDArray[np.float64]:
+        """Sums of the density along an axis, or two in growing order (0 is z), float64."""
+        total: NDArray[np.float64] = self.density.sum(axis=axis, dtype=np.float64)
+        return total
 
     @property
     def voxel_size(self) -> NDArray[np.float64]:
@@ -93,5 +90,28 @@ class Volume:
         for corner in np.ndindex(2, 2, 2):
             index = np.minimum(low + corner, n - 1)
             weight = np.prod(np.where(np.array(corner) == 1, frac, 1 - frac), axis=1)
-            value += weight * self.density[index[:, 2], index[:, 1], index[:, 0]]
+            value += weight * self._at(index[:, 2], index[:, 1], index[:, 0])
         return np.where(inside, value, 0.0)
+
+    def _at(self, z: NDArray[np.int64], y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float32]:
+        found: NDArray[np.float32] = self.density[z, y, x]
+        return found
+
+
+def checked(samples: NDArray[np.float32], to_world: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The samples of a density grid and its place, both read-only; raises InputError for what no `Volume` may hold."""
+    matrix = np.array(to_world, dtype=np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(samples)))
+    if bad:
+        raise InputError(f"the density grid holds {bad} NaN or infinite values; clean the grid or clamp it on reading")
+    negative = int(np.count_nonzero(samples < 0))
+    if negative:
+        raise InputError(f"the density grid holds {negative} negative values; clean the grid or clamp it on reading")
+    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)) or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise InputError("to_world must be a finite affine 4 x 4 matrix")
+    size = np.linalg.norm(matrix[:3, :3], axis=0)
+    if np.any(size == 0) or abs(np.linalg.det(matrix[:3, :3] / size)) < 1e-6:
+        raise InputError("to_world is not invertible: the grid's box has no volume")
+    samples.flags.writeable = False
+    matrix.flags.writeable = False
+    return samples, matrix

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.volume._brick_levels import averaged, halved
 from deepclouds.volume._volume import Volume
+from deepclouds.volume.bricks import Bricks
+from deepclouds.volume.sparse import SparseVolume
+
+# A level of a volume in bricks stays in bricks as long as all of its cells would be more than these, 64 MB.
+_MOST_DENSE_CELLS = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -35,16 +42,20 @@ class FilteredLevel:
     Attributes
     ----------
     values
-        float32 (nz, ny, nx), mean density of each cell.
+        float32 (nz, ny, nx), mean density of each cell, or its bricks.
     first
         (3,) integer cell coordinates (x, y, z) of ``values[0, 0, 0]``: cell c covers ``[c, c + 1] * spacing`` from the frame's origin.
     spacing
         edge of a cell, world units.
     """
 
-    values: NDArray[np.float32]
+    values: NDArray[np.float32] | Bricks
     first: NDArray[np.int64]
     spacing: float
+
+    def dense(self) -> NDArray[np.float32]:
+        """All cells (nz, ny, nx), whether they are kept in bricks or not."""
+        return self.values.dense() if isinstance(self.values, Bricks) else self.values
 
 
 def volume_frame(volume: Volume, origin: NDArray[np.float64] | None = None) -> Frame:
@@ -60,11 +71,11 @@ def volume_frame(volume: Volume, origin: NDArray[np.float64] | None = None) -> F
     if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4):
         raise InputError("the grid's axes are not perpendicular: resample the sheared volume to a box first")
     if origin is None:
-        mass = volume.density.sum(axis=0, dtype=np.float64)
+        mass = volume.sums(0)
         total = float(mass.sum())
         centre = np.full(3, 0.5)
         if total > 0:
-            depth = volume.density.sum(axis=(1, 2), dtype=np.float64)
+            depth = volume.sums((1, 2))
             for axis, weights in enumerate((mass.sum(axis=0), mass.sum(axis=1), depth)):
                 centre[axis] = float(weights @ (np.arange(len(weights)) + 0.5)) / total / len(weights)
         origin = edges @ centre + volume.to_world[:3, 3]
@@ -76,10 +87,11 @@ def mean_extinction(volume: Volume) -> float:
 
     The reciprocal of `scale` times this is the unit of length of the descriptor.
     """
-    total = float(volume.density.sum(dtype=np.float64))
+    stored = volume.stored
+    total = float(stored.sum(dtype=np.float64))
     if total <= 0:
         return 0.0
-    return float(np.einsum("ijk,ijk->", volume.density, volume.density, dtype=np.float64)) / total
+    return float(np.einsum("ijk,ijk->", stored, stored, dtype=np.float64)) / total
 
 
 def optical_size(volume: Volume, scale: float) -> float:
@@ -120,26 +132,47 @@ def filtered_levels(volume: Volume, frame: Frame, spacings: list[float]) -> list
     The first level holds the exact averages of the trilinear field with its hard cut at the box; each further one averages 2 x 2 x 2
     cells, which is the same as averaging the field itself.
     """
-    levels: list[FilteredLevel] = []
+    return list(each_filtered_level(volume, frame, spacings))
+
+
+def each_filtered_level(volume: Volume, frame: Frame, spacings: list[float]) -> Iterator[FilteredLevel]:
+    """The levels of `filtered_levels` one after the other, so that those in bricks need not all be kept at once."""
+    level: FilteredLevel | None = None
     for spacing in spacings:
-        if not levels:
-            corner = frame.axes.T @ (volume.to_world[:3, 3] - frame.origin)
-            lengths = np.linalg.norm(volume.to_world[:3, :3], axis=0)
-            values = volume.density
-            first = np.zeros(3, np.int64)
-            # Contract z, y, x in turn; axis 0 always holds the one to do next, and moves to the end when done.
-            for axis in (2, 1, 0):
-                weights, first[axis] = _cell_weights(values.shape[0], float(lengths[axis]), float(corner[axis]), spacing)
-                values = np.tensordot(values, weights.astype(np.float32), axes=(0, 1))
+        if level is None:
+            level = _first_level(volume, frame, spacing)
+        elif isinstance(level.values, Bricks):
+            level = _in_bricks(*halved(level.values, level.first), spacing)
         else:
-            previous = levels[-1]
-            first = previous.first // 2
-            before = previous.first - 2 * first
-            shape = np.array(previous.values.shape[::-1])
-            after = (before + shape) % 2
-            pad = [(int(before[a]), int(after[a])) for a in (2, 1, 0)]
-            padded = np.pad(previous.values, pad)
-            nz, ny, nx = padded.shape
-            values = padded.reshape(nz // 2, 2, ny // 2, 2, nx // 2, 2).mean(axis=(1, 3, 5))
-        levels.append(FilteredLevel(np.ascontiguousarray(values, np.float32), first, spacing))
-    return levels
+            level = _halved(level.values, level.first, spacing)
+        yield level
+
+
+def _first_level(volume: Volume, frame: Frame, spacing: float) -> FilteredLevel:
+    corner = frame.axes.T @ (volume.to_world[:3, 3] - frame.origin)
+    lengths = np.linalg.norm(volume.to_world[:3, :3], axis=0)
+    axes = [_cell_weights(n, float(lengths[a]), float(corner[a]), spacing) for a, n in enumerate(volume.resolution)]
+    first = np.array([cell for _, cell in axes], np.int64)
+    weights = [w.astype(np.float32) for w, _ in axes]
+    if isinstance(volume, SparseVolume):
+        return _in_bricks(*averaged(volume.bricks, weights, first), spacing)
+    values = volume.density
+    # Contract z, y, x in turn; axis 0 always holds the one to do next, and moves to the end when done.
+    for axis in (2, 1, 0):
+        values = np.tensordot(values, weights[axis], axes=(0, 1))
+    return FilteredLevel(np.ascontiguousarray(values, np.float32), first, spacing)
+
+
+def _in_bricks(values: Bricks, first: NDArray[np.int64], spacing: float) -> FilteredLevel:
+    few = int(np.prod(values.shape, dtype=np.int64)) <= _MOST_DENSE_CELLS
+    return FilteredLevel(values.dense() if few else values, first, spacing)
+
+
+def _halved(values: NDArray[np.float32], first: NDArray[np.int64], spacing: float) -> FilteredLevel:
+    new = first // 2
+    before = first - 2 * new
+    after = (before + np.array(values.shape[::-1])) % 2
+    padded = np.pad(values, [(int(before[a]), int(after[a])) for a in (2, 1, 0)])
+    nz, ny, nx = padded.shape
+    means = padded.reshape(nz // 2, 2, ny // 2, 2, nx // 2, 2).mean(axis=(1, 3, 5))
+    return FilteredLevel(np.ascontiguousarray(means, np.float32), new, spacing)
