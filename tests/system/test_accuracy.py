@@ -6,15 +6,18 @@ a low one; intervals hold what they should; the last line has the agreed form; a
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from deepclouds_training.calibrate import Judged
 from numpy.typing import NDArray
 from scipy import special
 
 from benchmarks import accuracy
+from benchmarks.accuracy_confidence import rise, tenths
 from benchmarks.accuracy_figures import bootstrap, noise_free
 from benchmarks.accuracy_furnace import FurnaceCloud, furnace_rows, plan, tile_means
 from benchmarks.accuracy_slabs import Slab, cases, discrete_ordinates, leaving_flux
@@ -25,6 +28,7 @@ from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
 from deepclouds.model import multiple_scattering
+from deepclouds.model.trust import FLOOR
 from deepclouds.volume import Volume
 
 Floats = NDArray[np.float64]
@@ -160,9 +164,29 @@ def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:
     assert all(text.count(mark) == 1 for mark in marks("accuracy"))
 
 
-def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixture[str], llvm_mitsuba: object) -> None:
+def test_tenths_find_an_error_that_is_known() -> None:
+    """Expected behaviour: errors that grow with what sorts the labels rise from tenth to tenth; what is expected is returned as it is."""
+    rng = np.random.default_rng(5)
+    n = 20_000
+    expected = rng.uniform(0.05, 0.4, n)
+    j = rng.uniform(0.5, 2.0, n)
+    truth = j + expected * (j + FLOOR) * np.where(rng.random(n) < 0.5, -1, 1)
+    half_a, half_b = (truth + 0.1 * rng.normal(size=n) for _ in range(2))
+    judged = Judged(rng.random(n), j, half_a, half_b, np.full(n, 0.07), rng.integers(0, 30, n))
+    deciles = tenths(judged, expected, expected)
+    for decile in deciles:
+        assert decile.found.value == pytest.approx(decile.expected, rel=0.1)
+        assert decile.found.low <= decile.expected * 1.1
+        assert decile.found.high >= decile.expected * 0.9
+    assert rise(deciles) == pytest.approx(0.365 / 0.085, rel=0.1)
+    # Distances that have nothing to do with the error.
+    assert rise(tenths(judged, expected, judged.distance)) == pytest.approx(1, abs=0.1)
+
+
+def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixture[str], llvm_mitsuba: object, knowing_model: str) -> None:
     """Expected behaviour: very little of every part is measured, written and drawn, and the last line sums it up."""
-    assert accuracy.main(["--quick", "--only", "ball_isotropic", "--labels", str(small_dataset), "--out", str(tmp_path)]) == 0
+    where = ["--labels", str(small_dataset), "--out", str(tmp_path)]
+    assert accuracy.main(["--quick", "--only", "ball_isotropic", "--model", knowing_model, *where]) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     number = r"[+-]?\d+\.\d+"
     last = f"accuracy: worst rRMSE {number} %, worst energy {number} %, furnace rms {number} %, slab error {number}"
@@ -172,8 +196,11 @@ def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixt
         assert any(part in line for line in lines), part
         assert part in written or part == "congestus 7100"
     assert lines[-1] in written
-    pictures = {"scenes", "furnace", "slabs", "special", "labels"}
+    pictures = {"scenes", "furnace", "slabs", "special", "labels", "confidence"}
     assert {p.name for p in tmp_path.glob("*.png")} == {f"accuracy_{name}.png" for name in pictures}
+    kept = json.loads((tmp_path / "accuracy.json").read_text())
+    assert kept["headline"] == lines[-1]
+    assert {row["part"] for row in kept["rows"]} == {"scene", "furnace", "slabs", "labels", "special", "confidence"}
 
 
 def test_bad_input_is_refused(tmp_path: Path) -> None:
