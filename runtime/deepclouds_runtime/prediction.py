@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from functools import lru_cache
 from os import PathLike, fspath
@@ -13,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from deepclouds.volume import Volume
     from deepclouds_runtime.scattering import Predicts
+
+_LOG = logging.getLogger(__name__)
 
 
 def predict(
@@ -61,6 +64,10 @@ def predict(
     -------
     float64 array (n,): J / E, 1 / steradian. The radiance that a path of length dt adds is ``sigma_t J dt``.
 
+    Notes
+    -----
+    What the model was not trained on is extrapolated, and logged as a warning.
+
     Raises
     ------
     InputError
@@ -100,4 +107,7 @@ def predict(
 def _predictor(model: str | None, phase: tuple[float, float, float], albedo: float, size: float) -> Any:
     from deepclouds_runtime.predictor import predictor_for
 
-    return predictor_for(model, phase, (albedo,), size)
+    predictor = predictor_for(model, phase, (albedo,), size)
+    if unknown := predictor.outside(phase, (albedo,), size):
+        _LOG.warning("the model %s was not trained for %s: J is extrapolated", predictor.path.stem, ", ".join(unknown))
+    return predictor
