@@ -14,7 +14,7 @@ def clean(density: NDArray[np.float32], source: str, clamp: bool) -> NDArray[np.
     Parameters
     ----------
     density
-        float32 array (nz, ny, nx).
+        float32 array of any shape.
     source
         the file (and grid) for the error message.
     clamp

@@ -28,10 +28,23 @@ library_version: str
 
 def read_headers(path: str) -> list[Header]: ...
 def describe_grid(path: str, index: int) -> Description: ...
-def read_dense(path: str, index: int, max_voxels: int) -> tuple[FloatDescription, NDArray[np.float32] | None]: ...
+def count_bricks(path: str, index: int, max_voxels: int) -> int | None: ...
+def read_floats(
+    path: str, index: int, dense_voxels: int, max_voxels: int, max_box: int
+) -> tuple[FloatDescription, NDArray[np.float32] | None, NDArray[np.int32] | None, NDArray[np.float32] | None]: ...
 def write_dense(
     path: str,
     density: NDArray[np.float32],
+    index_to_world: NDArray[np.float64],
+    name: str,
+    half: bool,
+    prune: bool,
+    metadata: dict[str, str | int | float | bool],
+) -> None: ...
+def write_bricks(
+    path: str,
+    places: NDArray[np.int32],
+    values: NDArray[np.float32],
     index_to_world: NDArray[np.float64],
     name: str,
     half: bool,

@@ -22,9 +22,14 @@ from deepclouds.replacing import replacing
 from deepclouds.volume import _openvdb
 from deepclouds.volume._clean import clean
 from deepclouds.volume._volume import Volume
+from deepclouds.volume.bricks import Bricks
+from deepclouds.volume.sparse import MAX_VOXELS, SparseVolume
 
-MAX_VOXELS = 2**30
-"""Largest box that is read densely: 4 GiB of float32. A grid with two far-flung voxels must not exhaust the machine."""
+DENSE_VOXELS = 2**26
+"""Boxes up to this many voxels, 256 MiB, are read densely: lookups are quicker there."""
+
+MAX_BOX = 2**36
+"""Largest box that is read: what points at its bricks takes 4 GiB. A grid with two far-flung voxels must not exhaust the machine."""
 
 # OpenVDB keeps its own facts among a grid's metadata, under these names.
 _RESERVED = ("class", "name", "is_local_space", "is_saved_as_half_float", "vector_type", "value_type")
@@ -56,6 +61,8 @@ class GridInfo:
         how many voxels are active, those inside active tiles included.
     index_box
         smallest and largest index (x, y, z) of an active voxel, both inside; None for an empty grid.
+    bricks
+        how many bricks of 8^3 voxels of the box hold something; None for grids that are not of floats, empty, or too large to be read.
     metadata
         the grid's metadata; values that are neither text, number nor truth value appear as text.
     """
@@ -70,6 +77,7 @@ class GridInfo:
     voxel_size: tuple[float, float, float]
     active_voxels: int
     index_box: tuple[tuple[int, int, int], tuple[int, int, int]] | None
+    bricks: int | None
     metadata: Mapping[str, str | int | float | bool]
 
 
@@ -106,9 +114,10 @@ def list_grids(path: str | PathLike[str]) -> list[GridInfo]:
         for index, header in enumerate(_openvdb.read_headers(str(file))):
             name, unique, kind, half = header["name"], header["unique_name"], header["value_type"], header["half"]
             if not header["known"]:
-                grids.append(GridInfo(name, unique, kind, half, "unknown", "", None, (0.0, 0.0, 0.0), 0, None, {}))
+                grids.append(GridInfo(name, unique, kind, half, "unknown", "", None, (0.0, 0.0, 0.0), 0, None, None, {}))
                 continue
             d = _openvdb.describe_grid(str(file), index)
+            bricks = _openvdb.count_bricks(str(file), index, MAX_VOXELS) if kind == "float" else None
             matrix = None if d["index_to_world"] is None else np.array(d["index_to_world"], np.float64)
             grids.append(
                 GridInfo(
@@ -122,6 +131,7 @@ def list_grids(path: str | PathLike[str]) -> list[GridInfo]:
                     d["voxel_size"],
                     d["active_voxels"],
                     d["index_box"],
+                    bricks,
                     d["metadata"],
                 )
             )
@@ -150,11 +160,14 @@ def _choose(file: Path, headers: Sequence[_openvdb.Header], grid: str | None) ->
     return matches[0]
 
 
-def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = False) -> Volume:
+def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = False, dense_voxels: int = DENSE_VOXELS) -> Volume:
     """Read one fog volume, cropped to the box of its active voxels.
 
     Values are those that OpenVDB itself returns at each index of that box: active voxels, active tiles and, where a file has
     any, values stored in inactive voxels. Rotated, sheared and non-uniform transforms are kept.
+
+    A box of more than `dense_voxels` voxels becomes a `SparseVolume` where the bricks of 8^3 voxels that hold something take at most half
+    of it, and where it has more than `MAX_VOXELS`.
 
     Parameters
     ----------
@@ -164,6 +177,8 @@ def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = F
         name of a float grid (stored with 32 or 16 bits); without it the only float grid, or else the one called ``density``.
     clamp
         set negative values and NaN to 0 instead of refusing them.
+    dense_voxels
+        boxes up to this many voxels are dense whatever they hold.
 
     Raises
     ------
@@ -177,19 +192,25 @@ def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = F
     index = _choose(file, headers, grid)
     source = f"{file}: the grid '{headers[index]['unique_name']}'"
     with _native_errors(file):
-        info, density = _openvdb.read_dense(str(file), index, MAX_VOXELS)
+        info, density, places, values = _openvdb.read_floats(str(file), index, dense_voxels, MAX_VOXELS, MAX_BOX)
     if info["grid_class"] == "level set":
         raise InputError(f"{source} is a level set, a distance to a surface; convert it to a fog volume first")
     if info["index_to_world"] is None:
         raise InputError(f"{source} has a {info['transform_type']}, which is not affine; resample it to an affine transform first")
     if info["background"] != 0:
         raise InputError(f"{source} has the background value {info['background']:g}: it is not empty outside; set its background to 0")
-    if density is None or info["index_box"] is None:
+    if info["index_box"] is None:
         raise InputError(f"{source} is empty: it has no active voxel")
-    lower = np.array(info["index_box"][0], np.float64)
-    unit_to_index = np.diag([*density.shape[::-1], 1.0])
+    lower, upper = (np.array(corner, np.int64) for corner in info["index_box"])
+    nx, ny, nz = (int(n) for n in upper - lower + 1)
+    unit_to_index = np.diag([float(nx), ny, nz, 1.0])
     unit_to_index[:3, 3] = lower - 0.5
-    return Volume(clean(density, source, clamp), np.array(info["index_to_world"], np.float64) @ unit_to_index)
+    to_world = np.array(info["index_to_world"], np.float64) @ unit_to_index
+    if density is not None:
+        return Volume(clean(density, source, clamp), to_world)
+    assert places is not None
+    assert values is not None
+    return SparseVolume(Bricks((nz, ny, nx), places, clean(values, source, clamp)), to_world)
 
 
 def write_vdb(
@@ -228,7 +249,7 @@ def write_vdb(
     reserved = [key for key in metadata or {} if key in _RESERVED or key.startswith("file_")]
     if reserved:
         raise InputError(f"{file}: OpenVDB keeps the metadata {', '.join(reserved)} itself; choose other names")
-    highest = float(volume.density.max())
+    highest = float(volume.stored.max(initial=0))
     if half and highest > float(np.finfo(np.float16).max):
         raise InputError(f"{file}: the largest density, {highest:g}, does not fit into 16 bits; write it with half=False")
     nx, ny, nz = volume.resolution
@@ -236,4 +257,8 @@ def write_vdb(
     index_to_unit[:3, 3] = 0.5 / np.array([nx, ny, nz])
     index_to_world = np.ascontiguousarray(volume.to_world @ index_to_unit)
     with replacing(file) as temporary, _native_errors(file):
-        _openvdb.write_dense(str(temporary), volume.density, index_to_world, name, half, prune, dict(metadata or {}))
+        if isinstance(volume, SparseVolume):
+            places, values = volume.bricks.places, volume.bricks.values
+            _openvdb.write_bricks(str(temporary), places, values, index_to_world, name, half, prune, dict(metadata or {}))
+        else:
+            _openvdb.write_dense(str(temporary), volume.density, index_to_world, name, half, prune, dict(metadata or {}))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepclouds.errors import InputError
-from deepclouds.volume import Volume, _openvdb, list_grids, read_vdb, read_vol, write_vdb
+from deepclouds.volume import Bricks, SparseVolume, Volume, _openvdb, list_grids, read_vdb, read_vol, write_vdb
 
 DATA = Path(__file__).parent / "data"
 
@@ -231,3 +231,79 @@ def test_public_volumes_agree_with_their_vol_twins(public_scenes: Path, name: st
     box = [slice(int(hit.min()), int(hit.max()) + 1) for hit in np.nonzero(vol)]
     positive = [slice(int(hit.min()), int(hit.max()) + 1) for hit in np.nonzero(vdb)]
     np.testing.assert_array_equal(vol[tuple(box)], vdb[tuple(positive)])
+
+
+def test_bricks_hold_tiles(tmp_path: Path) -> None:
+    """A solid block, which pruning turns into tiles, in a box that begins in the middle of a leaf."""
+    density = np.zeros((70, 70, 70), np.float32)
+    density[20:50, 16:61, 8:40] = 3
+    density[3, 5, 7] = density[66, 62, 61] = 1
+    write_vdb(tmp_path / "a.vdb", Volume.from_box(density, (0, 0, 0), (1, 1, 1)))
+    dense, sparse = (read_vdb(tmp_path / "a.vdb", dense_voxels=most) for most in (70**3, 0))
+    assert isinstance(sparse, SparseVolume)
+    np.testing.assert_array_equal(dense.density, density[3:67, 5:63, 7:62])
+    np.testing.assert_array_equal(sparse.density, dense.density)
+    np.testing.assert_array_equal(sparse.to_world, dense.to_world)
+
+
+def scattered() -> Volume:
+    density = np.zeros((90, 61, 77), np.float32)
+    rng = np.random.default_rng(9)
+    for _ in range(5):
+        z, y, x = (int(rng.integers(3, n - 9)) for n in density.shape)
+        density[z : z + 7, y : y + 6, x : x + 8] = rng.random((7, 6, 8))
+    return Volume.from_box(density, (-1, 2, 3), (4, 5, 9))
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_bricks_survive_a_file(half: bool, tmp_path: Path) -> None:
+    """Written from bricks and from a dense grid: files that read as the same grid, in bricks whose corner is the box's."""
+    volume = scattered()
+    sparse = SparseVolume(Bricks.from_dense(volume.density), volume.to_world)
+    write_vdb(tmp_path / "a.vdb", volume, half=half)
+    write_vdb(tmp_path / "b.vdb", sparse, half=half)
+    dense = read_vdb(tmp_path / "a.vdb")
+    for name in ("a", "b"):
+        again = read_vdb(tmp_path / f"{name}.vdb", dense_voxels=1000)
+        assert isinstance(again, SparseVolume)
+        assert again.bricks.values.any(axis=(1, 2, 3)).all()
+        np.testing.assert_array_equal(again.density, dense.density)
+        np.testing.assert_allclose(again.to_world, dense.to_world, rtol=1e-12)
+        assert list_grids(tmp_path / f"{name}.vdb")[0].bricks == len(again.bricks.places)
+
+
+def test_a_grid_that_is_mostly_filled_stays_dense(tmp_path: Path) -> None:
+    density = np.random.default_rng(1).random((20, 20, 20)).astype(np.float32)
+    write_vdb(tmp_path / "a.vdb", Volume.from_box(density, (0, 0, 0), (1, 1, 1)))
+    assert type(read_vdb(tmp_path / "a.vdb", dense_voxels=0)) is Volume
+
+
+def test_a_box_that_no_dense_grid_could_fill(tmp_path: Path) -> None:
+    """Two voxels 3000 apart along each axis: two bricks; whoever needs the whole grid is told that it does not fit."""
+    values = np.zeros((2, 8, 8, 8), np.float32)
+    values[:, 0, 0, 0] = 2, 3
+    ends = np.array([[0, 0, 0], [374, 375, 376]], np.int32)
+    bricks = Bricks((3001, 3001, 3009), ends, values)
+    write_vdb(tmp_path / "a.vdb", SparseVolume(bricks, np.diag([3009.0, 3001, 3001, 1])))
+    again = read_vdb(tmp_path / "a.vdb")
+    assert isinstance(again, SparseVolume)
+    assert again.resolution == (3009, 3001, 2993)
+    np.testing.assert_array_equal(again.bricks.places, ends)
+    points = np.array([[0.5, 0.5, 0.5], [3008.5, 3000.5, 2992.5], [9, 9, 9]])
+    np.testing.assert_array_equal(again.sample(points), [2, 3, 0])
+    with pytest.raises(InputError, match="3009 x 3001 x 2993 voxels is needed whole"):
+        _ = again.density
+
+
+@pytest.mark.parametrize(("value", "match"), [(np.nan, "1 NaN"), (-1.0, "1 negative"), (np.inf, "1 infinite")])
+def test_bad_values_in_bricks_are_found(value: float, match: str, tmp_path: Path) -> None:
+    values = np.zeros((2, 8, 8, 8), np.float32)
+    values[:, 0, 0, 0] = 2, value
+    volume = SparseVolume(Bricks((80, 80, 80), np.array([[0, 0, 0], [9, 9, 9]], np.int32), np.ones_like(values)), np.eye(4))
+    # What no volume may hold is put into the file behind its back.
+    object.__setattr__(volume, "bricks", Bricks((80, 80, 80), volume.bricks.places, values))
+    write_vdb(tmp_path / "a.vdb", volume)
+    with pytest.raises(InputError, match=match):
+        read_vdb(tmp_path / "a.vdb", dense_voxels=0)
+    if not np.isinf(value):
+        np.testing.assert_array_equal(read_vdb(tmp_path / "a.vdb", clamp=True, dense_voxels=0).stored.sum(), 2)

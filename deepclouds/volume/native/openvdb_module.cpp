@@ -1,4 +1,4 @@
-// deepclouds.volume._openvdb: what a .vdb file holds, one float grid as a dense array, and a dense array as a .vdb file.
+// deepclouds.volume._openvdb: what a .vdb file holds, one float grid as a dense array or as bricks, and either as a .vdb file.
 //
 // Everything that OpenVDB throws reaches Python as VdbError with OpenVDB's own words. The Python side (deepclouds/volume/vdb.py)
 // decides which grids are acceptable; here lies only what needs the C++ library.
@@ -13,8 +13,13 @@
 #include <openvdb/openvdb.h>
 #include <openvdb/tools/Dense.h>
 
+#include <algorithm>
+#include <array>
 #include <cstdint>
+#include <cstdlib>
 #include <fstream>
+#include <memory>
+#include <new>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -227,48 +232,205 @@ nb::dict describe_grid(const std::string& path, std::size_t index) {
 }
 
 using DenseArray = nb::ndarray<nb::numpy, float, nb::ndim<3>, nb::c_contig>;
+using BrickArray = nb::ndarray<nb::numpy, float, nb::ndim<4>, nb::c_contig>;
+using PlaceArray = nb::ndarray<nb::numpy, std::int32_t, nb::ndim<2>, nb::c_contig>;
+using Freed = std::unique_ptr<void, decltype(&std::free)>;
 
-nb::tuple read_dense(const std::string& path, std::size_t index, std::uint64_t max_voxels) {
-    Reader reader(path);
+constexpr int EDGE = 8;
+constexpr std::size_t BRICK = EDGE * EDGE * EDGE;
+
+// Extents of a box. Its corners are 32-bit integers: its extents need 64, its volume may need more.
+struct Extent {
+    std::uint64_t n[3];
+    double voxels = 1;
+
+    explicit Extent(const openvdb::CoordBBox& box) {
+        for (int axis = 0; axis < 3; ++axis) {
+            n[axis] = static_cast<std::uint64_t>(static_cast<std::int64_t>(box.max()[axis]) - box.min()[axis] + 1);
+            voxels *= static_cast<double>(n[axis]);
+        }
+    }
+
+    std::string text() const { return std::to_string(n[0]) + " x " + std::to_string(n[1]) + " x " + std::to_string(n[2]); }
+};
+
+// The bricks of a grid that hold something: places (x, y, z) in bricks from the box's corner on, and values, z slowest.
+struct Bricks {
+    std::vector<std::array<std::int32_t, 3>> places;
+    Freed values{nullptr, &std::free};
+};
+
+// Places of the bricks that nodes of the tree with any value but 0 reach; sorted along z, y, x. Gives up with false beyond `most`.
+bool candidates(const openvdb::FloatGrid& grid, const openvdb::CoordBBox& box, std::size_t most, std::vector<std::array<std::int32_t, 3>>& out) {
+    const auto reach = [&](openvdb::CoordBBox node) {
+        node.intersect(box);
+        if (node.empty()) {
+            return true;
+        }
+        std::int64_t low[3], high[3];
+        double count = 1;
+        for (int axis = 0; axis < 3; ++axis) {
+            low[axis] = (static_cast<std::int64_t>(node.min()[axis]) - box.min()[axis]) / EDGE;
+            high[axis] = (static_cast<std::int64_t>(node.max()[axis]) - box.min()[axis]) / EDGE;
+            count *= static_cast<double>(high[axis] - low[axis] + 1);
+        }
+        // A leaf may reach eight bricks that its neighbours reach too.
+        if (static_cast<double>(out.size()) + count > 8.0 * static_cast<double>(most)) {
+            return false;
+        }
+        for (std::int64_t z = low[2]; z <= high[2]; ++z) {
+            for (std::int64_t y = low[1]; y <= high[1]; ++y) {
+                for (std::int64_t x = low[0]; x <= high[0]; ++x) {
+                    out.push_back({static_cast<std::int32_t>(x), static_cast<std::int32_t>(y), static_cast<std::int32_t>(z)});
+                }
+            }
+        }
+        return true;
+    };
+    const auto& tree = grid.tree();
+    for (auto leaf = tree.cbeginLeaf(); leaf; ++leaf) {
+        if (!reach(leaf->getNodeBoundingBox())) {
+            return false;
+        }
+    }
+    auto tile = tree.cbeginValueAll();
+    tile.setMaxDepth(openvdb::FloatTree::ValueAllCIter::LEAF_DEPTH - 1);
+    for (; tile; ++tile) {
+        if (*tile != 0.0f && !reach(tile.getBoundingBox())) {
+            return false;
+        }
+    }
+    std::sort(out.begin(), out.end(), [](const auto& a, const auto& b) {
+        return std::lexicographical_compare(a.rbegin(), a.rend(), b.rbegin(), b.rend());
+    });
+    out.erase(std::unique(out.begin(), out.end()), out.end());
+    return out.size() <= most;
+}
+
+// Bricks of the box with any value but 0, whether active or not; of values only where `keep` says so. False beyond `most` bricks.
+bool collect(const openvdb::FloatGrid& grid, const openvdb::CoordBBox& box, std::size_t most, bool keep, Bricks& out) {
+    using Dense = openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ>;
+    std::vector<std::array<std::int32_t, 3>> reached;
+    if (!candidates(grid, box, most, reached)) {
+        return false;
+    }
+    const auto resize = [&out](std::size_t count) {
+        void* larger = std::realloc(out.values.get(), std::max<std::size_t>(count, 1) * BRICK * sizeof(float));
+        if (!larger) {
+            throw std::bad_alloc();
+        }
+        static_cast<void>(out.values.release());
+        out.values.reset(larger);
+    };
+    // Memory that is never written costs nothing, and what is left over is given back.
+    resize(keep ? reached.size() : 1);
+    std::vector<float> part(BRICK);
+    for (const auto& place : reached) {
+        openvdb::Coord low, high;
+        for (int axis = 0; axis < 3; ++axis) {
+            low[axis] = box.min()[axis] + EDGE * place[axis];
+            high[axis] = static_cast<int>(std::min<std::int64_t>(static_cast<std::int64_t>(low[axis]) + EDGE - 1, box.max()[axis]));
+        }
+        const openvdb::CoordBBox inside(low, high);
+        float* const to = static_cast<float*>(out.values.get()) + (keep ? out.places.size() * BRICK : 0);
+        const bool whole = inside.volume() == BRICK;
+        Dense dense(inside, whole ? to : part.data());
+        openvdb::tools::copyToDense(grid, dense, true);
+        if (!whole) {
+            std::fill(to, to + BRICK, 0.0f);
+            const openvdb::Coord n = inside.dim();
+            for (int z = 0; z < n.z(); ++z) {
+                for (int y = 0; y < n.y(); ++y) {
+                    const float* const row = part.data() + (static_cast<std::size_t>(z) * n.y() + y) * n.x();
+                    std::copy(row, row + n.x(), to + (z * EDGE + y) * EDGE);
+                }
+            }
+        }
+        if (std::any_of(to, to + BRICK, [](float value) { return value != 0.0f; })) {
+            out.places.push_back(place);
+        }
+    }
+    if (keep) {
+        resize(out.places.size());
+    }
+    return true;
+}
+
+openvdb::FloatGrid::Ptr load_floats(Reader& reader, std::size_t index) {
     openvdb::GridBase::Ptr base;
     {
         nb::gil_scoped_release release;
         base = reader.load(index);
     }
-    const auto grid = openvdb::gridPtrCast<openvdb::FloatGrid>(base);
+    auto grid = openvdb::gridPtrCast<openvdb::FloatGrid>(base);
     if (!grid) {
         throw VdbError("the grid '" + base->getName() + "' holds " + base->valueType() + " values, not float");
     }
+    return grid;
+}
+
+// Number of bricks that hold something; None for a grid without active voxels, and for one that has more than `max_voxels` in them.
+nb::object count_bricks(const std::string& path, std::size_t index, std::uint64_t max_voxels) {
+    Reader reader(path);
+    const auto grid = load_floats(reader, index);
+    const openvdb::CoordBBox box = grid->evalActiveVoxelBoundingBox();
+    Bricks bricks;
+    bool fits = false;
+    if (!box.empty()) {
+        nb::gil_scoped_release release;
+        fits = collect(*grid, box, max_voxels / BRICK, false, bricks);
+    }
+    return fits ? nb::cast(bricks.places.size()) : nb::none();
+}
+
+// A float grid, cropped to its active voxels, as (description, dense array or None, places or None, values or None): dense up to
+// `dense_voxels`, beyond in bricks if those take at most half of the box, or else dense up to `max_voxels`.
+nb::tuple read_floats(const std::string& path, std::size_t index, std::uint64_t dense_voxels, std::uint64_t max_voxels, std::uint64_t max_box) {
+    Reader reader(path);
+    auto grid = load_floats(reader, index);
     nb::dict info = describe(reader.at(index), *grid);
     info["background"] = grid->background();
     const openvdb::CoordBBox box = grid->evalActiveVoxelBoundingBox();
     if (box.empty()) {
-        return nb::make_tuple(info, nb::none());
+        return nb::make_tuple(info, nb::none(), nb::none(), nb::none());
     }
-    // The corners of a box are 32-bit integers: its extents need 64, its volume may need more.
-    std::uint64_t extent[3];
-    double voxels = 1;
-    for (int axis = 0; axis < 3; ++axis) {
-        extent[axis] = static_cast<std::uint64_t>(static_cast<std::int64_t>(box.max()[axis]) - box.min()[axis] + 1);
-        voxels *= static_cast<double>(extent[axis]);
+    const Extent extent(box);
+    Bricks bricks;
+    bool sparse = false;
+    if (extent.voxels > static_cast<double>(dense_voxels) && extent.voxels <= static_cast<double>(max_box)) {
+        nb::gil_scoped_release release;
+        sparse = collect(*grid, box, max_voxels / BRICK, true, bricks);
+        const double kept = static_cast<double>(bricks.places.size() * BRICK);
+        sparse = sparse && (2 * kept <= extent.voxels || extent.voxels > static_cast<double>(max_voxels));
     }
-    if (voxels > static_cast<double>(max_voxels)) {
-        throw VdbError("the grid '" + grid->getName() + "' spans " + std::to_string(extent[0]) + " x " + std::to_string(extent[1]) + " x " +
-                       std::to_string(extent[2]) + " voxels, more than the " + std::to_string(max_voxels) + " that are read densely");
+    if (sparse) {
+        const std::size_t count = bricks.places.size();
+        auto* places = new std::int32_t[3 * count];
+        const nb::capsule places_owner(places, [](void* p) noexcept { delete[] static_cast<std::int32_t*>(p); });
+        for (std::size_t i = 0; i < count; ++i) {
+            std::reverse_copy(bricks.places[i].begin(), bricks.places[i].end(), places + 3 * i);
+        }
+        auto* values = static_cast<float*>(bricks.values.release());
+        const nb::capsule owner(values, [](void* p) noexcept { std::free(p); });
+        return nb::make_tuple(info, nb::none(), PlaceArray(places, {count, 3}, places_owner), BrickArray(values, {count, EDGE, EDGE, EDGE}, owner));
     }
-    auto* values = new float[static_cast<std::size_t>(voxels)];
+    if (extent.voxels > static_cast<double>(max_voxels)) {
+        throw VdbError("the grid '" + grid->getName() + "' spans " + extent.text() + " voxels, more than the " + std::to_string(max_voxels) +
+                       " that fit, and its bricks of " + std::to_string(EDGE) + "^3 that hold something do not fit either");
+    }
+    auto* values = new float[static_cast<std::size_t>(extent.voxels)];
     const nb::capsule owner(values, [](void* p) noexcept { delete[] static_cast<float*>(p); });
     {
         nb::gil_scoped_release release;
         openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ> dense(box, values);
         openvdb::tools::copyToDense(*grid, dense);
     }
-    return nb::make_tuple(info, DenseArray(values, {extent[2], extent[1], extent[0]}, owner));
+    return nb::make_tuple(info, DenseArray(values, {extent.n[2], extent.n[1], extent.n[0]}, owner), nb::none(), nb::none());
 }
 
-void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>& density,
-                 const nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>& index_to_world, const std::string& name,
-                 bool half, bool prune, const nb::dict& metadata) {
+// An empty fog volume with its transform, name and metadata.
+openvdb::FloatGrid::Ptr new_grid(const nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>& index_to_world,
+                                 const std::string& name, bool half, const nb::dict& metadata) {
     openvdb::FloatGrid::Ptr grid = openvdb::FloatGrid::create(0.0f);
     grid->setName(name);
     grid->setGridClass(openvdb::GRID_FOG_VOLUME);
@@ -285,7 +447,6 @@ void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndi
             grid->insertMeta(k, openvdb::StringMetadata(nb::cast<std::string>(value)));
         }
     }
-    nb::gil_scoped_release release;
     openvdb::Mat4d m;
     for (int r = 0; r < 4; ++r) {
         for (int c = 0; c < 4; ++c) {
@@ -293,12 +454,10 @@ void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndi
         }
     }
     grid->setTransform(openvdb::math::Transform::createLinearTransform(m));
-    const auto last = [](std::size_t n) { return static_cast<int>(n) - 1; };
-    const openvdb::CoordBBox box({0, 0, 0}, {last(density.shape(2)), last(density.shape(1)), last(density.shape(0))});
-    // Dense holds a pointer to mutable values but copyFromDense only reads them.
-    const openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ> dense(box, const_cast<float*>(density.data()));
-    // Values equal to the background (0) stay inactive.
-    openvdb::tools::copyFromDense(dense, *grid, 0.0f);
+    return grid;
+}
+
+void write_grid(const std::string& path, const openvdb::FloatGrid::Ptr& grid, bool prune) {
     if (prune) {
         grid->pruneGrid();
     } else {
@@ -307,6 +466,44 @@ void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndi
     openvdb::io::File file(path);
     file.write({grid});
     file.close();
+}
+
+void write_dense(const std::string& path, const nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>& density,
+                 const nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>& index_to_world, const std::string& name,
+                 bool half, bool prune, const nb::dict& metadata) {
+    const openvdb::FloatGrid::Ptr grid = new_grid(index_to_world, name, half, metadata);
+    nb::gil_scoped_release release;
+    const auto last = [](std::size_t n) { return static_cast<int>(n) - 1; };
+    const openvdb::CoordBBox box({0, 0, 0}, {last(density.shape(2)), last(density.shape(1)), last(density.shape(0))});
+    // Dense holds a pointer to mutable values but copyFromDense only reads them.
+    const openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ> dense(box, const_cast<float*>(density.data()));
+    // Values equal to the background (0) stay inactive.
+    openvdb::tools::copyFromDense(dense, *grid, 0.0f);
+    write_grid(path, grid, prune);
+}
+
+// Bricks become leaves as they are: both have eight voxels along an edge.
+void write_bricks(const std::string& path, const nb::ndarray<const std::int32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>& places,
+                  const nb::ndarray<const float, nb::shape<-1, EDGE, EDGE, EDGE>, nb::c_contig, nb::device::cpu>& values,
+                  const nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>& index_to_world, const std::string& name,
+                  bool half, bool prune, const nb::dict& metadata) {
+    const openvdb::FloatGrid::Ptr grid = new_grid(index_to_world, name, half, metadata);
+    nb::gil_scoped_release release;
+    for (std::size_t i = 0; i < places.shape(0); ++i) {
+        const std::int32_t* const place = places.data() + 3 * i;
+        auto* const leaf = grid->tree().touchLeaf(openvdb::Coord(EDGE * place[2], EDGE * place[1], EDGE * place[0]));
+        const float* value = values.data() + i * BRICK;
+        for (int z = 0; z < EDGE; ++z) {
+            for (int y = 0; y < EDGE; ++y) {
+                for (int x = 0; x < EDGE; ++x, ++value) {
+                    if (*value != 0.0f) {
+                        leaf->setValueOn(openvdb::Coord(x, y, z), *value);
+                    }
+                }
+            }
+        }
+    }
+    write_grid(path, grid, prune);
 }
 
 }  // namespace
@@ -336,7 +533,10 @@ NB_MODULE(_openvdb, m) {
     m.attr("library_version") = std::string(openvdb::getLibraryVersionString());
     m.def("read_headers", &read_headers, nb::arg("path"));
     m.def("describe_grid", &describe_grid, nb::arg("path"), nb::arg("index"));
-    m.def("read_dense", &read_dense, nb::arg("path"), nb::arg("index"), nb::arg("max_voxels"));
+    m.def("count_bricks", &count_bricks, nb::arg("path"), nb::arg("index"), nb::arg("max_voxels"));
+    m.def("read_floats", &read_floats, nb::arg("path"), nb::arg("index"), nb::arg("dense_voxels"), nb::arg("max_voxels"), nb::arg("max_box"));
     m.def("write_dense", &write_dense, nb::arg("path"), nb::arg("density"), nb::arg("index_to_world"), nb::arg("name"), nb::arg("half"),
           nb::arg("prune"), nb::arg("metadata"));
+    m.def("write_bricks", &write_bricks, nb::arg("path"), nb::arg("places"), nb::arg("values"), nb::arg("index_to_world"), nb::arg("name"),
+          nb::arg("half"), nb::arg("prune"), nb::arg("metadata"));
 }
