@@ -56,9 +56,12 @@ def keep(figures: Path, pictures: Sequence[Path], name: str) -> list[Path]:
 
 
 def as_typed(arguments: Sequence[str] | None) -> str:
-    """The command line, folders outside of this project by their last name alone."""
-    words = []
-    for word in sys.argv[1:] if arguments is None else arguments:
+    """The command line, folders outside of this project by their last name alone, and without where results go."""
+    words: list[str] = []
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    for before, word in zip(["", *given], given, strict=False):
+        if "--out" in (before, word):
+            continue
         path = Path(word)
         words.append(path.name if path.is_absolute() or word.startswith("..") else word)
     return shlex.join(["python", "-m", "benchmarks.accuracy", *words])

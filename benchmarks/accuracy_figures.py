@@ -24,7 +24,9 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """Value and interval."""
+        """Value and interval, which what is known exactly has none of."""
+        if self.low == self.value == self.high:
+            return self.bare
         return f"{self.bare} [{self._number(self.low)}, {self._number(self.high)}]"
 
     @property

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ _PARTS = {
     "labels": "Held-out labels",
     "special": "Cases known to be hard",
 }
+# A picture's own noise, which differs from model to model.
+_NOISE = re.compile(r" \(noise [^)]*\)")
 _HEAD = """\
 Written by `deepclouds card` from the files' metadata and measured figures: `make card` writes it anew. `deepclouds info` prints all that a
 file says, `deepclouds verify NAME` checks what it computes on this machine. A render without `--model` takes the first of the released
@@ -44,6 +47,9 @@ _LIMITS = """\
 - Hard shadows from afar, and shapes with hard edges that no cloud has, are harder than clouds: see the cases below. The expected error
   does not see all of them: where it is too small, the table says so.
 - Surfaces are unknown to the network: what they shade and reflect comes from the renderer."""
+_MEASURED = """\
+With 95 % intervals; [accuracy.md](accuracy.md) says how each is measured. Held-out labels and slabs cover all that users may set, also what
+a model's ranges leave out. By"""
 _TRUST = """\
 A query's *distance* is how far a summary of its stencil and inputs lies from the training data, in units of their spread; half of the
 training data lie within the first figure, 99 % within the second. The *expected error* grows with it, and is calibrated on held-out
@@ -174,7 +180,7 @@ def _errors(subjects: Sequence[Subject]) -> list[str]:
     measured = [s for s in subjects if s.figures is not None]
     if not measured:
         return ["Not measured: `python -m benchmarks.accuracy --card` writes the figures of a model."]
-    lines = ["With 95 % intervals; [accuracy.md](accuracy.md) says how each is measured. By", ""]
+    lines = [_MEASURED, ""]
     lines += [f"- `{s.name}`: `{s.figures['command']}`, {s.figures['machine']}" for s in measured if s.figures]
     lines += ["", *(f"- `{s.name}`: {s.figures['headline']}" for s in measured if s.figures)]
     for part, title in _PARTS.items():
@@ -183,7 +189,7 @@ def _errors(subjects: Sequence[Subject]) -> list[str]:
             for row in (subject.figures or {})["rows"]:
                 if row["part"] == part:
                     for name, text in row["figures"].items():
-                        found.setdefault(f"{row['case']}: {name}", {})[subject.name] = text
+                        found.setdefault(f"{_NOISE.sub('', row['case'])}: {name}", {})[subject.name] = text
         if found:
             rows = {case: [cells.get(s.name, "") for s in measured] for case, cells in found.items()}
             lines += ["", f"### {title}", "", *_table(measured, rows)]
@@ -205,7 +211,7 @@ def _trust(subjects: Sequence[Subject]) -> list[str]:
         rows = [row for row in (subject.figures or {"rows": []})["rows"] if row["part"] == "confidence" and "expected error" in row["case"]]
         if rows:
             lines += ["", f"| `{subject.name}` | expected | found |", "|---|---|---|"]
-            lines += [f"| {row['case']} | {row['figures']['expected'].split(' [')[0]} | {row['figures']['found']} |" for row in rows]
+            lines += [f"| {row['case']} | {row['figures']['expected']} | {row['figures']['found']} |" for row in rows]
     return lines
 
 

@@ -101,6 +101,6 @@ def test_figures_and_pictures_are_kept_for_the_card(figures: Path, tmp_path: Pat
 
 def test_a_command_names_no_machines_folders(tmp_path: Path) -> None:
     said = accuracy_card.as_typed(
-        ["--scenes", "../elsewhere/scenes", "--labels", str(tmp_path / "labels"), "--labels", "work/valid", "--card"]
+        ["--scenes", "../elsewhere/scenes", "--labels", str(tmp_path / "labels"), "--labels", "work/valid", "--out", "x", "--card"]
     )
     assert said == "python -m benchmarks.accuracy --scenes scenes --labels labels --labels work/valid --card"

@@ -26,7 +26,7 @@ from deepclouds.volume import Volume, read_vol, write_vol
 from deepclouds.volume.pyramid import optical_size
 
 Image = NDArray[np.float32]
-SUN = {"sun": (60.0, 30.0), "sky": 0.0, "size": (32, 24)}
+SUN: dict[str, Any] = {"sun": (60.0, 30.0), "sky": 0.0, "size": (32, 24)}
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +75,7 @@ def rendered(cloud: Path, predictor: Doubting, **options: Any) -> RenderResult:
 )
 def test_a_known_share_comes_out_in_every_pixel(cloud: Path, options: dict[str, Any]) -> None:
     found = rendered(cloud, Doubting(0.2, 0.2), **options).channels
-    indirect, total = (sum(found[prefix + c] for c in "RGB") for prefix in ("volume_indirect.", ""))
+    indirect, total = (np.sum([found[prefix + c] for c in "RGB"], axis=0) for prefix in ("volume_indirect.", ""))
     expected = 1 - np.where(total > 0, 0.2 * indirect / np.maximum(total, 1e-20), 0)
     assert (indirect > 0).mean() > 0.2
     # Thin rims that no pilot ray met are taken from beside them, or have nothing to go by.
