@@ -65,6 +65,14 @@ class Volume:
         total: NDArray[np.float64] = self.density.sum(axis=axis, dtype=np.float64)
         return total
 
+    def row_ends(self, above: float | np.float32) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The rows along x with a sample larger than `above`: (z, y) of each (m, 2), and its first and last such sample (m,)."""
+        filled = self.density > above
+        rows = np.argwhere(filled.any(axis=2))
+        first = filled.argmax(axis=2)[tuple(rows.T)]
+        last = filled.shape[2] - 1 - filled[:, :, ::-1].argmax(axis=2)[tuple(rows.T)]
+        return rows, first, last
+
     @property
     def voxel_size(self) -> NDArray[np.float64]:
         """Edge lengths of a voxel along the grid's own x, y and z axes, in world units."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 # Voxels along a brick's edge: that of OpenVDB's leaves.
 EDGE = 8
 BRICK_VOXELS = EDGE**3
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +105,20 @@ class Bricks:
             total[where] += values.sum(axis=1 + axis, dtype=np.float64)
         return from_columns(total)[: self.shape[first], : self.shape[second]]
 
+    def row_ends(self, above: float | np.float32) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The rows along x with a sample larger than `above`: (z, y) of each (m, 2), and its first and last such sample (m,)."""
+        nz, ny, nx = self.grid
+        first = np.full((nz, ny, EDGE, EDGE), EDGE * nx, np.int32)
+        last = np.full((nz, ny, EDGE, EDGE), -1, np.int32)
+        for layer, where, values in self.layers(2):
+            filled = values > above
+            found = filled.any(axis=3)
+            first[where] = np.where(found, np.minimum(first[where], EDGE * layer + filled.argmax(axis=3)), first[where])
+            last[where] = np.where(found, EDGE * layer + EDGE - 1 - filled[..., ::-1].argmax(axis=3), last[where])
+        rows = np.argwhere(from_columns(last) >= 0)
+        ends = [from_columns(end)[tuple(rows.T)].astype(np.int64) for end in (first, last)]
+        return rows, ends[0], ends[1]
+
     def window_maxima(self, before: bool) -> NDArray[np.float32]:
         """Largest sample of every brick (bz, by, bx), kept or not, and of the samples that touch it.
 
@@ -137,7 +153,7 @@ def into_bricks(dense: NDArray[np.float32]) -> NDArray[np.float32]:
     return dense.reshape(nz, EDGE, ny, EDGE, nx, EDGE).transpose(0, 2, 4, 1, 3, 5)
 
 
-def from_columns(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_columns(columns: NDArray[_Kind]) -> NDArray[_Kind]:
     """Array (8 b, 8 b') from columns of bricks (b, b', 8, 8)."""
     b, c = columns.shape[:2]
     return columns.transpose(0, 2, 1, 3).reshape(EDGE * b, EDGE * c)

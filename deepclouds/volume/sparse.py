@@ -73,5 +73,9 @@ class SparseVolume(Volume):
         total: NDArray[np.float64] = self.bricks.sums(axis[0]).sum(axis=axis[1] - 1)
         return total
 
+    def row_ends(self, above: float | np.float32) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The rows along x with a sample larger than `above`, not below 0: (z, y) of each, and its first and last such sample."""
+        return self.bricks.row_ends(above)
+
     def _at(self, z: NDArray[np.int64], y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float32]:
         return self.bricks.at(z, y, x)

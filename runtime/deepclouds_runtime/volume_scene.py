@@ -243,14 +243,14 @@ def _check(options: VolumeOptions) -> None:
 def extinction(volume: Volume, options: VolumeOptions, source: str) -> float:
     """Extinction at density 1, 1 / world length, that the options ask for."""
     if options.extinction is not None:
-        thickest = options.extinction * float(volume.density.max())
+        thickest = options.extinction * float(volume.stored.max(initial=0))
         if thickest > _LARGEST:
             raise InputError(f"extinction = {options.extinction:g}: the densest voxel gets {thickest:g}; it may have {_LARGEST:g} at most")
         return options.extinction
     depth = _DEFAULT_OPTICAL_DEPTH if options.optical_depth is None else options.optical_depth
     edges = volume.voxel_size
     axis = int(np.argmax(edges * volume.resolution))
-    line = float(volume.density.sum(axis=2 - axis, dtype=np.float64).max() * edges[axis])
+    line = float(volume.sums(2 - axis).max() * edges[axis])
     if line == 0:
         if options.optical_depth is None:
             return 0.0
@@ -316,12 +316,9 @@ def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
 
 def _framed_corners(volume: Volume) -> NDArray[np.float64]:
     """World corners (n, 3) of the voxels at the ends of each row along x that holds something; of the box when all are empty."""
-    filled = volume.density > _FRAMED * volume.density.max()
-    rows = np.argwhere(filled.any(axis=2))
+    rows, first, last = volume.row_ends(_FRAMED * volume.stored.max(initial=0))
     if len(rows):
-        first = filled.argmax(axis=2)[tuple(rows.T)]
-        last = filled.shape[2] - filled[:, :, ::-1].argmax(axis=2)[tuple(rows.T)]
-        ends = np.concatenate([np.column_stack([x, rows[:, 1], rows[:, 0]]) for x in (first, last)]).astype(np.float64)
+        ends = np.concatenate([np.column_stack([x, rows[:, 1], rows[:, 0]]) for x in (first, last + 1)]).astype(np.float64)
         grid = np.concatenate([ends + np.array([0, dy, dz]) for dy, dz in np.ndindex(2, 2)])
     else:
         grid = np.array(list(np.ndindex(2, 2, 2))) * np.array(volume.resolution, np.float64)

@@ -63,6 +63,9 @@ def test_bricks_hold_the_grid(shape: tuple[int, int, int]) -> None:
     axes: list[int | tuple[int, int]] = [0, 1, 2, (1, 2), (0, 1)]
     for axis in axes:
         np.testing.assert_allclose(sparse.sums(axis), volume.sums(axis), rtol=1e-12)
+    for above in (0.0, 0.5):
+        for found, expected in zip(sparse.row_ends(above), volume.row_ends(above), strict=True):
+            np.testing.assert_array_equal(found, expected)
     assert mean_extinction(sparse) == pytest.approx(mean_extinction(volume), rel=1e-12)
     np.testing.assert_allclose(volume_frame(sparse).origin, volume_frame(volume).origin, rtol=1e-12)
     points = points_in(volume, 500, 1)
