@@ -84,6 +84,8 @@ class Statistics:
         cells level by level, and ``error`` of the interpolation at a point, measured.
     skipped
         reason -> queries that were not needed.
+    complete
+        whether the render came to its end: neither interrupted, nor a picture on the way.
     network
         where the network knows its errors: ``error`` to expect of the cloud's light, and ``doubtful``, the share of that light in pixels of
         low confidence.
@@ -93,6 +95,7 @@ class Statistics:
     spp: int = 0
     mean_spp: float = 0.0
     noise: float | None = None
+    complete: bool = True
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     network: dict[str, float] = field(default_factory=dict)
@@ -222,7 +225,13 @@ class Renderer:
         return count
 
     def render(
-        self, spp: int | None = None, seed: int = 0, progress: Callable[[float], None] | None = None, error: float = ERROR
+        self,
+        spp: int | None = None,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        error: float = ERROR,
+        partial: Callable[[RenderResult], None] | None = None,
+        interrupted: Callable[[], bool] | None = None,
     ) -> RenderResult:
         """Render an image.
 
@@ -236,6 +245,13 @@ class Renderer:
             is called with the share of the work done, 0 to 1.
         error
             of the fast mode: noise of a pixel to aim at, root of the mean square over the mean; the interpolation may add half as much.
+        partial
+            is called with the image so far, first of all with a quick look (fast mode: one sample a pixel, J at few nodes, surfaces without
+            the cloud's light), then after each round of samples but the last. The look is thrown away: the final image is the same with
+            and without `partial`, but for rounding.
+        interrupted
+            is asked between passes whether to stop. The image is then made of what there is, of one sample of every pixel at least, and
+            its statistics are not ``complete``.
 
         Raises
         ------
@@ -252,8 +268,17 @@ class Renderer:
         if scene.max_depth != 2:
             scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering), self._lights()
-        work = _Work(scene, Camera(types, scene.sensor), cloud, lights, lights, types, seed, self._interreflection)
+        camera = Camera(types, scene.sensor)
+        work = _Work(scene, camera, cloud, lights, lights, types, seed, self._interreflection)
         work.spent("lights", started)
+        if fast and partial is not None:
+            clock = time.perf_counter()
+            look = _Work(scene, camera, cloud, lights, lights, types, seed, False)
+            look.prepare(math.inf, quick=True)
+            look.round(0, 1, most, None)
+            partial(self._result(look, started, None, False))
+            work.counts.queries += look.counts.queries
+            work.spent("quick look", clock)
         if fast and self._interreflection:
             work.prepare_thrown(_INTERPOLATION * error)
         if self._interreflection:
@@ -264,24 +289,48 @@ class Renderer:
         if fast:
             work.prepare(_INTERPOLATION * error)
         noise = math.inf
-        if spp is not None or not fast:
+        stopped = False
+        if (spp is not None or not fast) and partial is None and interrupted is None:
             work.round(0, most, most, progress)
+        elif spp is not None or not fast:
+            # The same samples, in rounds that double their number.
+            work.round(0, 1, most, progress)
+            while work.samples < most and not (stopped := interrupted is not None and interrupted()):
+                before, done = work.beauty(), work.samples
+                if partial is not None:
+                    partial(self._result(work, started, noise, False))
+                stopped = work.round(done, min(done, most - done), most, progress, interrupted)
+                if stopped:
+                    break
+                noise, _ = work.settle(before, done, error, rest=False)
         else:
             asked = int(scene.sensor.sampler().sample_count())
             _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
             growth = 2.0
             work.round(0, 1, most, None)
-            while work.samples < most and not noise <= error:
+            while work.samples < most and not noise <= error and not (stopped := interrupted is not None and interrupted()):
                 before, done = work.beauty(), work.samples
-                work.round(done, min(math.ceil(done * (growth - 1)), most - done), most, None)
+                if partial is not None:
+                    partial(self._result(work, started, noise, False))
+                stopped = work.round(done, min(math.ceil(done * (growth - 1)), most - done), most, None, interrupted)
+                if stopped:
+                    break
                 noise, growth = work.settle(before, done, error)
                 if progress is not None:
                     progress(min(error / max(noise, 1e-9), 1.0) ** 2)
+        return self._result(work, started, noise, not stopped)
+
+    def _result(self, work: _Work, started: float, noise: float | None, complete: bool) -> RenderResult:
+        """The image so far; `noise` as estimated, infinite or None where it was not."""
         channels = work.image()
         seconds = {"load": self._load_seconds, **work.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
         statistics = Statistics(
-            "fast" if fast else "reference", work.samples, float(work.taken.mean()), noise if math.isfinite(noise) else None
+            "reference" if work.sources is None else "fast",
+            int(work.taken.max()),
+            float(work.taken.mean()),
+            noise if noise is not None and math.isfinite(noise) else None,
+            complete,
         )
         for name, source in (*work.named.items(), ("light on surfaces", None if work.all_round is None else work.all_round.source)):
             if source is not None:
@@ -291,7 +340,7 @@ class Renderer:
         if "confidence" in channels:
             statistics.network = doubtful(channels["confidence"], channels)
             notes += tuple(filter(None, [warning(statistics.network)]))
-        return RenderResult(rgb, channels["A"], channels, seconds, work.counts, statistics, notes)
+        return RenderResult(rgb, channels["A"], channels, seconds, replace(work.counts), statistics, notes)
 
     def _lights(self) -> Lights:
         """The lights, with the tables that depend on them: made anew for each render."""
@@ -392,10 +441,10 @@ class _Work:
         one = dr.opaque(self.types.UInt32, 1)
         return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
 
-    def prepare(self, tolerance: float) -> None:
-        """Predict multiple scattering for this camera; from then on camera rays ask no network."""
+    def prepare(self, tolerance: float, quick: bool = False) -> None:
+        """Predict multiple scattering for this camera; from then on camera rays ask no network. `quick`: at an eighth of the nodes."""
         clock = time.perf_counter()
-        pixel, numbers = self._pilot(_PILOT)
+        pixel, numbers = self._pilot(_PILOT // 4 if quick else _PILOT)
         origin, direction, end = self.camera.rays(pixel, numbers)
         if self.scene.surfaces is not None:
             _, end, _ = self._surfaces(origin, direction, end)
@@ -404,15 +453,16 @@ class _Work:
         clock = time.perf_counter()
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
+        wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
         for source, _ in self.on_cloud.sources:
-            around += from_source(self.types, source, _BEAMS, isinstance(source, Environment), self.seed)
+            around += from_source(self.types, source, beams, isinstance(source, Environment), self.seed)
         # What is a large part of all light gets the fine nodes of a sun.
         power = sum(max(light.irradiance) for light in around)
         suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
         around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
         found = {
-            "suns": frame_source(self.cloud, suns, [self.camera], seen, _ROOT, tolerance, _BUDGET),
-            "light from all around": frame_source(self.cloud, around, [self.camera], seen, _ROOT_AROUND, tolerance, _BUDGET),
+            "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, tolerance, _BUDGET),
+            "light from all around": frame_source(self.cloud, around, [self.camera], seen, wide * _ROOT_AROUND, tolerance, _BUDGET),
         }
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
@@ -420,18 +470,29 @@ class _Work:
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
 
-    def round(self, first: int, samples: int, most: int, progress: Callable[[float], None] | None) -> None:
-        """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all."""
+    def round(
+        self,
+        first: int,
+        samples: int,
+        most: int,
+        progress: Callable[[float], None] | None,
+        interrupted: Callable[[], bool] | None = None,
+    ) -> bool:
+        """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all; returns whether it was interrupted."""
         total = len(self._active)
         pixels = max(1, _PASS // samples)
         for start in range(0, total, pixels):
-            self.add(self._active[start : start + pixels], first, samples, most)
+            if interrupted is not None and interrupted():
+                return True
+            chosen = self._active[start : start + pixels]
+            self.add(chosen, first, samples, most)
+            self.taken[chosen] += samples
             if progress is not None:
                 progress((first + samples * min(start + pixels, total) / total) / most)
-        self.taken[self._active] += samples
         self.samples += samples
+        return False
 
-    def settle(self, before: Image, done: int, error: float) -> tuple[float, float]:
+    def settle(self, before: Image, done: int, error: float, rest: bool = True) -> tuple[float, float]:
         """Estimate the noise, and let blocks of pixels rest that add little to it.
 
         Parameters
@@ -440,6 +501,8 @@ class _Work:
             the image before the last round, and how many samples its pixels had taken.
         error
             noise to aim at, over the mean.
+        rest
+            whether blocks may rest.
 
         Returns
         -------
@@ -455,6 +518,8 @@ class _Work:
             return 0.0, 1.0
         allowed = (error * float(after[lit].mean(dtype=np.float64))) ** 2 * np.count_nonzero(lit)
         noise = error * math.sqrt(float(self._variance[lit].sum()) / allowed) if allowed > 0 else 0.0
+        if not rest:
+            return noise, 1.0
         # A pixel's own estimate has two numbers behind it, a block's has many.
         index = np.arange(width * height)
         columns = -(-width // _BLOCK)
