@@ -20,14 +20,14 @@ from deepclouds.medium.phase import INV_4PI, hg_numpy, sample_two_lobe_cosine
 from deepclouds.model import aux_inputs
 
 # Suns of a point: two independent sets.
-SETS, SUNS = 2, 8
+SUN_SETS, SUNS = 2, 8
 
 Singles = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Furnace:
-    """m points with `SETS` * `SUNS` suns each, flat over points and suns.
+    """m points with `SUN_SETS` * `SUNS` suns each, flat over points and suns.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ def furnace_loss(j: Tensor, single: Tensor, weight: Tensor) -> Tensor:
     For every point x and direction w at albedo 1 the integral over all suns of (S1 + J) / E is 1 (light that only scatters inside of a
     uniform radiance of 1 stays 1), and J / E = j / (4 pi). The suns of the two sets are independent, so their noise does not add up.
     """
-    residual = ((single + j) * weight).view(-1, SETS, SUNS).mean(dim=2) - 1.0
+    residual = ((single + j) * weight).view(-1, SUN_SETS, SUNS).mean(dim=2) - 1.0
     return torch.mean(residual[:, 0] * residual[:, 1])
 
 
@@ -100,7 +100,7 @@ def furnace_of(shard: Shard, field: Field, points: int, rng: Generator, unit_fac
     The density of the mixture of both weighs them all (balance heuristic), so that neither the phase peak nor the rest is left to chance.
     """
     types = field.types
-    i = np.repeat(rng.integers(0, len(shard.point), points), SETS * SUNS)
+    i = np.repeat(rng.integers(0, len(shard.point), points), SUN_SETS * SUNS)
     n = len(i)
     point, w, phase = shard.point[i], shard.w[i], shard.phase[i]
     g1, g2, share = phase.T

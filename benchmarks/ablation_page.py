@@ -10,6 +10,7 @@ import numpy as np
 from deepclouds.replacing import replacing
 
 PICTURE = "images/ablations.png"
+LINK = f"![Change of the error against the base, and error against cost]({PICTURE})"
 # Key in the results, heading, factor, signed.
 COLUMNS = (
     ("halves rRMSE", "rRMSE, halves", False),
@@ -47,8 +48,6 @@ def body(results: dict[str, Any]) -> str:
         "",
         "Processor time a query on one thread of onnxruntime, at the best of its batches. The network of width 192 "
         f"({large['weights']:,} weights, {large['multiply_adds']:,} multiply-adds) takes {1e6 * large['seconds']:.2f} us in the same run.",
-        "",
-        f"![Change of the error against the base, and error against cost]({PICTURE})",
     ]
     return "\n".join(lines)
 

@@ -21,8 +21,7 @@ from deepclouds_training.shards import open_dataset
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.ablation_furnace import SETS, SUNS, Furnace, FurnaceSource, furnace_loss
-from benchmarks.ablation_networks import Pooled
+from benchmarks.ablation_furnace import SUN_SETS, SUNS, Furnace, FurnaceSource, furnace_loss
 from benchmarks.ablation_variants import Variant
 from deepclouds.model import LEVELS
 from deepclouds.replacing import replacing
@@ -119,8 +118,9 @@ def recipe_of(config: NetworkConfig) -> Recipe:
 
 def hidden(network: Network, inputs: Inputs) -> Tensor:
     """All layers but the last."""
-    if isinstance(network, Pooled):
-        return network.read(inputs.raw, inputs.f)
+    if network.pooling is not None:
+        pooled = network.pooled(inputs.raw)
+        return network.through(lambda k: pooled[k], inputs.f, True)
     levels = inputs.levels[recipe_of(network.config)]
     return network.through(lambda k: levels[k], inputs.f, True)
 
@@ -149,7 +149,7 @@ class Learner:
     def fit(self, samples: Samples, readings: Readings) -> None:
         """Standardise the inputs, and start the head at the mean label."""
         self.network.fit_inputs(samples.stencil[:: max(1, len(samples) // 4096)], samples.label)
-        if not isinstance(self.network, Pooled):
+        if self.network.pooling is None:
             model = readings.models[recipe_of(self.network.config)]
             self.network.level_mean.copy_(model.level_mean)
             self.network.level_scale.copy_(model.level_scale)
@@ -202,7 +202,7 @@ class Learner:
 def _batch_of(furnace: tuple[Inputs, Tensor, Tensor] | None, b: int) -> tuple[Inputs, Tensor, Tensor] | None:
     if furnace is None:
         return None
-    size = FURNACE_POINTS * SETS * SUNS
+    size = FURNACE_POINTS * SUN_SETS * SUNS
     inputs, single, weight = furnace
     place = slice(b * size, (b + 1) * size)
     return inputs.rows(b * size, size), single[place], weight[place]
@@ -273,7 +273,7 @@ class Race:
         label = torch.from_numpy(pool.label[rows])
         extra = None
         if furnace is not None:
-            each, points = SETS * SUNS, len(furnace.single) // (SETS * SUNS)
+            each, points = SUN_SETS * SUNS, len(furnace.single) // (SUN_SETS * SUNS)
             chosen = (self.step * FURNACE_POINTS + np.arange(CHUNK * FURNACE_POINTS)) % points
             flat = (chosen[:, None] * each + np.arange(each)).ravel()
             of = self.readings.of(furnace.stencil[flat], furnace.aux[flat], torch.bfloat16)

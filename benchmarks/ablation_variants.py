@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from deepclouds_training.network import Network, NetworkConfig
 
-from benchmarks.ablation_networks import PHASE_COLUMNS, TAU_COLUMNS, Blind, Mirrored, Pooled, Ratio, Shared
+from benchmarks.ablation_networks import PHASE_COLUMNS, TAU_COLUMNS, Blind, DiffusionRatio, PooledAtOnce, Shared
 from deepclouds.model import LEVELS
 
 
@@ -47,7 +47,7 @@ BASE = "base"
 FURNACE_WEIGHT = 0.2
 FAST = "small networks"
 
-VARIANTS: tuple[Variant, ...] = (
+SEPARATE: tuple[Variant, ...] = (
     Variant(BASE, "base", "width 64, coarse first, a block a level, root of the depth, all features, power 1.5", _plain()),
     Variant("fine first", "levels", "blocks from the finest level to the coarsest", _plain(order="fine_first")),
     Variant("shared 64", "levels", "one block for all levels, with a code of the level", lambda: Shared(_config())),
@@ -58,20 +58,37 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("no phase features", "inputs", "the raw angle, its cosine, g and the weight alone", lambda: Blind(_config(), PHASE_COLUMNS)),
     Variant("density", "inputs", "the root of the density in the place of the depth", _plain(scale="density")),
     Variant("log", "inputs", "the logarithm in the place of the root", _plain(compression="log")),
-    Variant("symmetric", "inputs", "every block sees the stencil and its mirror image", lambda: Mirrored(_config())),
+    Variant("symmetric", "inputs", "every block sees the stencil and its mirror image", _plain(symmetric=True)),
     Variant("power 0", "loss", "absolute squared error", _plain(), powers=((0.0, 1.0),)),
     Variant("power 1", "loss", "power 1", _plain(), powers=((1.0, 1.0),)),
     Variant("power 2", "loss", "power 2", _plain(), powers=((2.0, 1.0),)),
     Variant("mixture", "loss", "half power 1, half power 2", _plain(), powers=((1.0, 0.5), (2.0, 0.5))),
     Variant("furnace", "loss", f"furnace identity with weight {FURNACE_WEIGHT:g}", _plain(), furnace=FURNACE_WEIGHT),
-    Variant("ratio to octaves", "head", "ratio to three octaves", lambda: Ratio(_config(), "octaves")),
-    Variant("ratio to diffusion", "head", "ratio to a diffusion estimate", lambda: Ratio(_config(), "diffusion")),
+    Variant("ratio to octaves", "head", "ratio to three octaves", _plain(head="octaves")),
+    Variant("ratio to diffusion", "head", "ratio to a diffusion estimate", lambda: DiffusionRatio(_config())),
     Variant("width 32", "width", "width 32", _plain(32)),
     Variant("width 128", "width", "width 128", _plain(128)),
     Variant("blocks 20", FAST, "a block a level, width 20", _plain(20)),
     Variant("half the levels", FAST, "levels 0, 2, 4, 6 and 8, width 32", _plain(32, levels=(0, 2, 4, 6, 8))),
     Variant("shared 48", FAST, "one block for all levels, width 48", lambda: Shared(_config(48))),
-    Variant("pooled 16", FAST, "16 pooled values a level, then layers of 96", lambda: Pooled(_config(96), 16, blocks=False)),
-    Variant("pooled 24", FAST, "24 pooled values a level, then layers of 88", lambda: Pooled(_config(88), 24, blocks=False)),
-    Variant("pooled blocks", FAST, "24 pooled values a level, then blocks of 36", lambda: Pooled(_config(36), 24, blocks=True)),
+    Variant("pooled 16", FAST, "16 pooled values a level, then layers of 96", lambda: PooledAtOnce(_config(96, channels=16))),
+    Variant("pooled 24", FAST, "24 pooled values a level, then layers of 88", lambda: PooledAtOnce(_config(88, channels=24))),
+    Variant("pooled blocks", FAST, "24 pooled values a level, then blocks of 36", _plain(36, channels=24)),
 )
+
+_BEST: dict[str, object] = {"scale": "density", "head": "octaves"}
+EVEN = (0, 2, 4, 6, 8)
+
+# What won above, together; the first row is the base once more, for the comparison.
+TOGETHER: tuple[Variant, ...] = (
+    Variant(BASE, "base", "as above", _plain()),
+    Variant("d + o", "together", "density, ratio to octaves", _plain(**_BEST)),
+    Variant("d + o + s", "together", "density, ratio to octaves, symmetric", _plain(**_BEST, symmetric=True)),
+    Variant("d + o + log", "together", "density, ratio to octaves, logarithm", _plain(**{**_BEST, "compression": "log"})),
+    Variant("d + o + s 128", "together", "density, ratio to octaves, symmetric, width 128", _plain(128, **_BEST, symmetric=True)),
+    Variant("pooled blocks d + o", FAST, "24 pooled values a level, blocks of 36, density, octaves", _plain(36, **_BEST, channels=24)),
+    Variant("pooled pairs", FAST, "16 pooled values a level, blocks of 40 for pairs", _plain(40, **_BEST, channels=16, together=2)),
+    Variant("pooled half 48", FAST, "16 pooled values of 5 levels, blocks of 48", _plain(48, **_BEST, channels=16, levels=EVEN)),
+    Variant("pooled half 40", FAST, "24 pooled values of 5 levels, blocks of 40", _plain(40, **_BEST, channels=24, levels=EVEN)),
+)
+SETS: dict[str, tuple[Variant, ...]] = {"separate": SEPARATE, "together": TOGETHER}

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from deepclouds_training.network import Network, NetworkConfig
 
-from benchmarks.ablation_page import PICTURE, body, draw
+from benchmarks.ablation_page import LINK, PICTURE, body, draw
 from benchmarks.ablation_results import figures, held_out, multiply_adds, predictions, query_seconds, weights
 from benchmarks.ablation_training import BATCH, Learner, Plan, Race
-from benchmarks.ablation_variants import BASE, VARIANTS
+from benchmarks.ablation_variants import BASE, SETS
 from benchmarks.page import write_results
 from deepclouds.errors import InputError
 from deepclouds.replacing import replacing
@@ -34,26 +34,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=Path("work/labels"))
     parser.add_argument("--minutes", type=float, default=35.0, help="of training, all networks together")
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--only", nargs="+", choices=[v.name for v in VARIANTS], help="these variants alone")
+    parser.add_argument("--set", choices=tuple(SETS), default="separate", help="departures one by one, or those that won together")
     parser.add_argument("--shards", type=int, default=Plan.shards, help="shards of a pool")
-    parser.add_argument("-o", "--output", type=Path, default=Path("work/ablations"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("work/ablations"), help="a folder for each set is made in it")
     parser.add_argument("--docs", action="store_true", help=f"write {RESULTS} of the output folder into {PAGE}, without training")
     options = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    path = options.output / RESULTS
     if options.docs:
-        if not path.exists():
-            raise InputError(f"{path}: no results yet; run without --docs first")
-        results = json.loads(path.read_text())
-        draw(results, PAGE.parent / PICTURE)
-        write_results(PAGE, "ablations", body(results))
+        paths = [options.output / name / RESULTS for name in SETS]
+        found = [json.loads(path.read_text()) for path in paths if path.exists()]
+        if not found:
+            raise InputError(f"{paths[0]}: no results yet; run without --docs first")
+        draw(found, PAGE.parent / PICTURE)
+        write_results(PAGE, "ablations", "\n\n".join([*(body(results) for results in found), LINK]))
         return 0
     plan = Plan(options.data, options.minutes, shards=options.shards)
-    chosen = [v for v in VARIANTS if options.only is None or v.name in options.only]
-    learners = [Learner(v, seed, plan) for v in chosen for seed in range(options.seeds)]
-    race = Race(plan, learners, options.output)
+    learners = [Learner(v, seed, plan) for v in SETS[options.set] for seed in range(options.seeds)]
+    folder = options.output / options.set
+    race = Race(plan, learners, folder)
     race.run()
     results = _judged(race)
+    path = folder / RESULTS
     with replacing(path, ".json") as temporary:
         temporary.write_text(json.dumps(results, indent=1))
     print(body(results))

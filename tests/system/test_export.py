@@ -85,11 +85,20 @@ def test_averaged_and_raw_weights_are_different_files(run: Path, tmp_path: Path,
     assert equal == raw
 
 
-@pytest.mark.parametrize("order", ["coarse_first", "fine_first"])
-@pytest.mark.parametrize("compression", ["log", "root"])
-def test_graph_is_the_network_for_every_batch_size(tmp_path: Path, order: Any, compression: Any) -> None:
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"order": "coarse_first", "compression": "log"},
+        {"order": "fine_first", "compression": "root"},
+        {"symmetric": True, "head": "octaves", "scale": "density", "compression": "root"},
+        {"channels": 16, "together": 2, "head": "octaves", "scale": "density", "compression": "root"},
+        {"channels": 8, "levels": (0, 3, 7, 9)},
+    ],
+    ids=str,
+)
+def test_graph_is_the_network_for_every_batch_size(shape: dict[str, Any]) -> None:
     torch.manual_seed(5)
-    network = Network(NetworkConfig(width=24, order=order, compression=compression))
+    network = Network(NetworkConfig(width=24, **shape))
     stencil, aux = export.seeded_samples(1000, seed=4)
     network.fit_inputs(stencil, np.ones(8, np.float32))
     session = onnxruntime.InferenceSession(export.to_onnx(network).SerializeToString(), providers=["CPUExecutionProvider"])

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 from deepclouds_training.network import FEATURES, ORDERS, AngleFeatures, Network, NetworkConfig
+from deepclouds_training.pooling import mirrored_points
 from pydantic import ValidationError
 
+from deepclouds.descriptor import offsets
 from deepclouds.medium.phase import hg_numpy
 from deepclouds.model import LEVELS, POINTS, aux_inputs
 
@@ -138,9 +140,12 @@ def test_levels_are_standardised_log1p_values(scale: Literal["depth", "density"]
     assert float(net.head.bias.detach()) == pytest.approx(np.log(0.37), rel=1e-5)
 
 
-def test_folded_network_is_the_same_function() -> None:
+@pytest.mark.parametrize(
+    "config", [SMALL, NetworkConfig(width=16, symmetric=True, head="octaves"), NetworkConfig(width=16, channels=4, compression="root")]
+)
+def test_folded_network_is_the_same_function(config: NetworkConfig) -> None:
     stencil, aux = random_inputs(64)
-    net = network()
+    net = network(config)
     net.fit_inputs(stencil.numpy(), np.ones(64, np.float32))
     torch.testing.assert_close(net.folded()(stencil, aux), net(stencil, aux), rtol=1e-5, atol=0)
 
@@ -159,3 +164,75 @@ def test_levels_without_a_block_are_not_read() -> None:
 def test_levels_that_do_not_ascend_or_exist_are_refused(levels: tuple[int, ...]) -> None:
     with pytest.raises(ValidationError, match="ascending"):
         NetworkConfig(levels=levels)
+
+
+def test_mirroring_turns_x_round_and_nothing_else() -> None:
+    assert np.array_equal(offsets()[mirrored_points()], offsets() * [-1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("config", "symmetric"),
+    [
+        (NetworkConfig(width=16, symmetric=True), True),
+        (NetworkConfig(width=16, channels=4, together=2), True),
+        (NetworkConfig(width=16, channels=4, levels=(0, 4, 8)), True),
+        (SMALL, False),
+    ],
+)
+def test_symmetric_networks_give_the_same_for_the_mirror_image_and_others_do_not(config: NetworkConfig, symmetric: bool) -> None:
+    stencil, aux = random_inputs(32)
+    net = network(config)
+    net.fit_inputs(stencil.numpy(), np.ones(32, np.float32))
+    with torch.no_grad():
+        turned = net(stencil[:, :, mirrored_points()], aux)
+        assert torch.allclose(net(stencil, aux), turned, rtol=1e-5, atol=0) == symmetric
+        # It is not blind either: another odd part makes another output.
+        other = stencil.clone()
+        other[:, :, offsets()[:, 0] < 0] += 1.0
+        assert not torch.allclose(net(stencil, aux), net(other, aux), rtol=1e-4, atol=0)
+
+
+def test_octaves_multiply_the_output() -> None:
+    stencil, aux = random_inputs(200)
+    net = network(NetworkConfig(width=16, head="octaves"))
+    with torch.no_grad():
+        net.head.weight.zero_()
+        net.head.bias.fill_(np.log(3.0))
+        got = net(stencil, aux).numpy()
+    gamma, g, _, _, _, log1p_tau = aux.numpy().T.astype(np.float64)
+    tau = np.expm1(log1p_tau)
+    lobes = [4 * np.pi * hg_numpy(np.cos(gamma), h) for h in (g**2, g**4, g**8)]
+    expected = 0.02 + sum(0.5**i * np.exp(-(0.5**i) * tau) * p for i, p in enumerate(lobes, 1))
+    np.testing.assert_allclose(got, 3 * expected, rtol=1e-3)
+
+
+def test_pooled_blocks_read_their_levels_and_no_others() -> None:
+    stencil, aux = random_inputs(8)
+    net = network(NetworkConfig(width=16, channels=4, together=2, levels=(0, 3, 5, 9)))
+    assert len(net.blocks) == 2
+    for k in range(LEVELS):
+        changed = stencil.clone()
+        changed[:, k] *= 3
+        assert torch.equal(net(changed, aux), net(stencil, aux)) == (k not in (0, 3, 5, 9)), f"level {k}"
+
+
+def test_pooling_makes_means() -> None:
+    """A homogeneous level is what it was in every channel as long as the weights sum to 1, as they do at the start."""
+    net = network(NetworkConfig(width=16, channels=5))
+    assert net.pooling is not None
+    pooled = net.pooling(torch.full((2, LEVELS, POINTS), 0.7))
+    torch.testing.assert_close(pooled, torch.full((2, LEVELS, 5), 0.7))
+    assert torch.all(net.pooling.weight() >= 0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"symmetric": True, "channels": 4}, "symmetric already"),
+        ({"together": 2}, "pooled levels alone"),
+        ({"channels": 4, "together": 3}, "divide"),
+    ],
+)
+def test_shapes_that_do_not_fit_together_are_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        NetworkConfig.model_validate(fields)

@@ -14,14 +14,17 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deepclouds.model import LEVELS, POINTS
+from deepclouds_training.pooling import Pooling, mirrored_points
 
 ORDERS = (1, 2, 4, 8)
 FEATURES = 6 + len(ORDERS) + 3
+# Columns of the features: the first of log(4 pi p_n) / 4, and log(1 + tau) / 4.
+LOG_PHASE, LOG1P_TAU = 2, 10
 LOWEST, HIGHEST = -14.0, 6.0
 STENCIL_LIMIT = 1e4
 ROOT_FLOOR = 0.05
@@ -45,7 +48,15 @@ class NetworkConfig(BaseModel):
     compression
         ``log``, log(1 + v), or ``root``, the fourth root of v + 0.05, which onnxruntime evaluates several times faster.
     levels
-        the levels that have a block, ascending from 0, the finest; the others are not read.
+        the levels that are read, ascending from 0, the finest.
+    head
+        what the exponential of the last layer is: ``absolute``, j itself, or ``octaves``, the ratio of j to `log_octaves`.
+    symmetric
+        the first layer of every block sees the level and its mirror image across the plane of light and view, and adds both.
+    channels
+        means to which a level is pooled before it is compressed, see `Pooling`; 0 reads all points.
+    together
+        pooled levels that one block reads.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -55,6 +66,10 @@ class NetworkConfig(BaseModel):
     scale: Literal["depth", "density"] = "depth"
     compression: Literal["log", "root"] = "log"
     levels: tuple[int, ...] = tuple(range(LEVELS))
+    head: Literal["absolute", "octaves"] = "absolute"
+    symmetric: bool = False
+    channels: int = Field(default=0, ge=0, le=225)
+    together: int = Field(default=1, ge=1, le=LEVELS)
 
     @field_validator("levels")
     @classmethod
@@ -62,6 +77,16 @@ class NetworkConfig(BaseModel):
         if not levels or list(levels) != sorted(set(levels) & set(range(LEVELS))):
             raise ValueError(f"levels are different, ascending numbers from 0 to {LEVELS - 1}, at least one of them")
         return levels
+
+    @model_validator(mode="after")
+    def _pooled(self) -> NetworkConfig:
+        if self.symmetric and self.channels:
+            raise ValueError("symmetric: pooled levels are symmetric already; leave it out, or channels")
+        if self.together > 1 and not self.channels:
+            raise ValueError(f"together = {self.together}: for pooled levels alone; give channels, or leave it out")
+        if len(self.levels) % self.together:
+            raise ValueError(f"together = {self.together}: has to divide the number of levels, {len(self.levels)}")
+        return self
 
 
 class AngleFeatures(nn.Module):
@@ -119,11 +144,20 @@ class AngleFeatures(nn.Module):
 
 
 class Block(nn.Module):
-    """``h = ReLU(V x + P f + W o + b)``, ``o' = ReLU(U h + c + o)``; the first block has no `o` to read."""
+    """``h = ReLU(V x + P f + W o + b)``, ``o' = ReLU(U h + c + o)``; the first block has no `o` to read.
 
-    def __init__(self, width: int, first: bool) -> None:
+    Where it is `symmetric`, h is the mean of that and of the same of the mirror image of `x`: with even and odd parts e and o of x it
+    is ReLU(Ve e + Vo o + ...) + ReLU(Ve e - Vo o + ...), which has all symmetric functions within reach.
+    """
+
+    mirror: Tensor
+
+    def __init__(self, width: int, first: bool, points: int = POINTS, symmetric: bool = False) -> None:
         super().__init__()
-        self.stencil = nn.Linear(POINTS, width)
+        self.stencil = nn.Linear(points, width)
+        self.symmetric = symmetric
+        if symmetric:
+            self.register_buffer("mirror", torch.from_numpy(mirrored_points()), persistent=False)
         self.features = nn.Linear(FEATURES, width, bias=False)
         self.carried = None if first else nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
@@ -136,10 +170,16 @@ class Block(nn.Module):
     def forward(self, x: Tensor, weight: Tensor, bias: Tensor, f: Tensor, o: Tensor | None) -> Tensor:
         """One level `x` (n, 225) through the `standardised` weights, the features `f`, the output `o` of the block before."""
         # Products accumulate into one buffer: each addmm becomes one Gemm with its addend in the exported graph.
-        h = torch.addmm(F.linear(f, self.features.weight, bias), x, weight.t())
-        if self.carried is None or o is None:
-            return F.relu(self.out(F.relu(h)))
-        h = F.relu(torch.addmm(h, o, self.carried.weight.t()))
+        h = F.linear(f, self.features.weight, bias)
+        if self.symmetric:
+            h = h if self.carried is None or o is None else torch.addmm(h, o, self.carried.weight.t())
+            mirrored = F.relu(torch.addmm(h, x, weight[:, self.mirror].t()))
+            h = 0.5 * (F.relu(torch.addmm(h, x, weight.t())) + mirrored)
+        else:
+            h = torch.addmm(h, x, weight.t())
+            h = F.relu(h if self.carried is None or o is None else torch.addmm(h, o, self.carried.weight.t()))
+        if o is None:
+            return F.relu(self.out(h))
         return F.relu(torch.addmm(o + self.out.bias, h, self.out.weight.t()))
 
 
@@ -162,14 +202,17 @@ class Network(nn.Module):
         super().__init__()
         self.config = config
         self.angle = AngleFeatures()
-        self.blocks = nn.ModuleList(Block(config.width, first=i == 0) for i in range(len(config.levels)))
+        points = config.channels * config.together or POINTS
+        count = len(config.levels) // config.together
+        self.blocks = nn.ModuleList(Block(config.width, i == 0, points, config.symmetric) for i in range(count))
+        self.pooling = Pooling(config.channels) if config.channels else None
         self.fc_1 = nn.Linear(config.width + FEATURES, config.width)
         self.fc_2 = nn.Linear(config.width + FEATURES, config.width)
         self.head = nn.Linear(config.width, 1)
         self.register_buffer("level_mean", torch.zeros(LEVELS))
         self.register_buffer("level_scale", torch.ones(LEVELS))
-        # Levels in the order in which the blocks read them.
-        self.sequence = list(config.levels)[:: -1 if config.order == "coarse_first" else 1]
+        # Levels in the order in which the blocks read them; of several that one block reads, the first.
+        self.sequence = list(config.levels[:: config.together])[:: -1 if config.order == "coarse_first" else 1]
         self.is_folded = False
         self._initialise()
 
@@ -194,7 +237,8 @@ class Network(nn.Module):
         """Standardise each level to mean 0 and deviation 1 over `stencil` (n, 10, 225), and start the head at the mean label (n,)."""
         with torch.no_grad():
             for k in range(LEVELS):
-                x = self.compressed(torch.from_numpy(stencil[:, k]), k)
+                level = torch.from_numpy(stencil[:, k])
+                x = self.compressed(level if self.pooling is None else level @ self.pooling.weight(), k)
                 self.level_mean[k] = x.mean()
                 # Where the training data hardly vary, dividing by their deviation would blow up whatever lies outside of them.
                 least = SMALLEST_DEVIATION * (self._floor(k) ** 0.25 if self.config.compression == "root" else 1.0)
@@ -205,6 +249,8 @@ class Network(nn.Module):
     def folded(self) -> Network:
         """The same function with the standardisation inside the weights, for export; not for training."""
         result = copy.deepcopy(self)
+        if self.pooling is not None:
+            return result
         for k, block in zip(self.sequence, result.blocks, strict=True):
             assert isinstance(block, Block)
             weight, bias = block.standardised(self.level_mean[k], self.level_scale[k])
@@ -234,12 +280,26 @@ class Network(nn.Module):
 
     def hidden(self, stencil: Tensor, aux: Tensor) -> Tensor:
         """All layers but the last, (n, width): what training may compute in half precision."""
+        f = self.angle(aux)
+        if self.pooling is not None:
+            pooled = self.pooled(stencil)
+            return self.through(lambda k: pooled[k], f, plain=True)
         levels = torch.unbind(stencil, dim=1)
         # Level by level, so that what is compressed is still in the cache when it is multiplied.
-        return self.through(lambda k: self.compressed(levels[k], k), self.angle(aux), self.is_folded)
+        return self.through(lambda k: self.compressed(levels[k], k), f, self.is_folded)
+
+    def pooled(self, stencil: Tensor) -> dict[int, Tensor]:
+        """What each block of pooled levels reads, standardised, (n, channels * together), by its first level."""
+        assert self.pooling is not None
+        config = self.config
+        read = stencil if config.levels == tuple(range(LEVELS)) else stencil[:, list(config.levels)]
+        means = torch.unbind(self.pooling(read).float(), dim=1)
+        ready = [(self.compressed(x, k) - self.level_mean[k]) * self.level_scale[k] for k, x in zip(config.levels, means, strict=True)]
+        n = config.together
+        return {config.levels[i]: torch.cat(ready[i : i + n], dim=1) for i in range(0, len(ready), n)}
 
     def through(self, level: Callable[[int], Tensor], f: Tensor, plain: bool) -> Tensor:
-        """All layers but the last, from what `level` gives for level k, (n, 225), and the features `f`.
+        """All layers but the last, from what `level` gives for level k, (n, 225) or less, and the features `f`.
 
         With `plain` the weights take it as it is: it is standardised already, or they are `folded`.
         """
@@ -253,16 +313,32 @@ class Network(nn.Module):
         return self.finish(o, f)
 
     def finish(self, o: Tensor, f: Tensor) -> Tensor:
-        """The two layers between the last block and the head."""
+        """The two layers between the last block and the head; with the head ``octaves`` the estimate's logarithm is one more column."""
         h: Tensor = F.relu(self.fc_1(torch.cat([o, f], dim=1)))
-        return F.relu(self.fc_2(torch.cat([h, f], dim=1)))
+        h = F.relu(self.fc_2(torch.cat([h, f], dim=1)))
+        return h if self.config.head == "absolute" else torch.cat([h, log_octaves(f)], dim=1)
 
     def leave(self, hidden: Tensor) -> Tensor:
         """The last layer: j (n,), an exponential, whose argument needs all digits."""
-        return self._exponential(self.head(hidden))
-
-    def _exponential(self, argument: Tensor) -> Tensor:
+        if self.config.head == "absolute":
+            argument = self.head(hidden)
+        else:
+            argument = self.head(hidden[:, :-1]) + hidden[:, -1:]
         return torch.exp(torch.clamp(argument.squeeze(1), LOWEST, HIGHEST))
+
+
+def log_octaves(f: Tensor) -> Tensor:
+    """Logarithm (n, 1) of an analytic estimate of j from features (n, `FEATURES`).
+
+    E = 0.02 + sum over i = 1, 2, 3 of 0.5^i exp(-0.5^i tau) 4 pi p_(2^i)(gamma), where p_n is the phase function after n scatterings:
+    the octaves of Wrenninge et al. 2013, "Oz: The Great and Volumetric" (a = b = 0.5), without the first, because j counts multiple
+    scattering alone, and with exact convolutions in the place of their scaled g. The constant stands for light that has lost all
+    memory of its direction.
+    """
+    columns = torch.split(f, 1, dim=1)
+    tau = torch.exp(4.0 * columns[LOG1P_TAU]) - 1.0
+    terms = [0.5**i * torch.exp(4.0 * columns[LOG_PHASE + i] - 0.5**i * tau) for i in (1, 2, 3)]
+    return torch.log(terms[0] + terms[1] + terms[2] + 0.02)
 
 
 def _powers(value: Tensor, one: Tensor) -> Tensor:
