@@ -64,10 +64,3 @@ def llvm_mitsuba() -> Iterator[ModuleType]:
     """The same with llvm_ad_rgb."""
     with _variant("llvm_ad_rgb") as module:
         yield module
-
-
-@pytest.fixture
-def mono_mitsuba() -> Iterator[ModuleType]:
-    """The same with llvm_ad_mono."""
-    with _variant("llvm_ad_mono") as module:
-        yield module

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from deepclouds_training.mitsuba_tracer import draw_directions
 from deepclouds_training.points import uniform_directions
 
 from benchmarks import label_cost, labels
 from benchmarks.label_cost import PHASES, TARGET, Cost, Task, effective_labels
 from benchmarks.label_information import Labels, Worth, judge, train
-from benchmarks.label_volpath import draw_directions
 from benchmarks.page import marks, write_results
 from deepclouds.backend import backend
 from deepclouds.errors import InputError
@@ -47,16 +47,18 @@ def test_correlated_labels_are_worth_less() -> None:
     assert effective_labels(np.zeros((10, 3))) == 0
 
 
-@pytest.mark.parametrize("g", [-0.5, 0.0, 0.85])
-def test_directions_follow_the_phase_function(g: float) -> None:
-    """Legendre moments of the angle to w are powers of g; the azimuth is even; every point gets directions around its own w."""
+@pytest.mark.parametrize("phase", [-0.5, 0.0, 0.85, (0.8, -0.4, 0.75)])
+def test_directions_follow_the_phase_function(phase: float | tuple[float, float, float]) -> None:
+    """Legendre moments of the angle to w are powers of g, for each lobe; the azimuth is even; each point's directions lie around its w."""
     rng = np.random.default_rng(2)
     w = rng.normal(size=(3, 3))
     w = (w / np.linalg.norm(w, axis=1, keepdims=True)).astype(np.float32)
-    d = draw_directions(rng, w, g, 200_000)
+    d = draw_directions(rng, w, phase, 200_000)
     np.testing.assert_allclose(np.linalg.norm(d, axis=2), 1, atol=1e-6)
     cosine = np.einsum("nwc,nc->nw", d, w.astype(np.float64))
-    for order, moment in ((1, g), (2, g**2), (4, g**4)):
+    g1, g2, weight = phase if isinstance(phase, tuple) else (phase, 0.0, 1.0)
+    for order in (1, 2, 4):
+        moment = weight * g1**order + (1 - weight) * g2**order
         values = np.polynomial.legendre.legval(cosine, np.eye(order + 1)[order])
         assert np.all(np.abs(values.mean(axis=1) - moment) < 4 * values.std(axis=1) / np.sqrt(d.shape[1]))
     across = d - cosine[..., None] * w[:, None]

@@ -343,7 +343,7 @@ def test_halves_are_independent_and_as_noisy_as_they_say(converged: tuple[Path, 
     assert abs((z**2).mean() - 1) < 4 * np.sqrt(3 / n)
 
 
-@pytest.mark.usefixtures("mono_mitsuba")
+@pytest.mark.usefixtures("scalar_mitsuba")
 def test_labels_from_mitsuba_agree(converged: tuple[Path, list[Shard]], tmp_path: Path) -> None:
     """Rationale: the two tracers share the points and nothing else.
 
@@ -358,9 +358,9 @@ def test_labels_from_mitsuba_agree(converged: tuple[Path, list[Shard]], tmp_path
         assert np.array_equal(getattr(a, name), getattr(b, name))
     assert np.array_equal(a.volume.density, b.volume.density)
     assert len(np.unique(a.phase, axis=0)) == 2
-    # The mean over points and suns, albedo 1: volpath's errors are independent, and our own are bounded as if a point's were all one.
+    # The mean over points and suns, albedo 1; the errors of a point's labels are bounded as if they were all one.
     mine, volpath = (shard.label[..., 0].astype(float) for shard in (a, b))
-    noise = np.sqrt((a.error[..., 0].sum(axis=1, dtype=float) ** 2).sum() + (b.error[..., 0].astype(float) ** 2).sum())
+    noise = np.sqrt(sum((shard.error[..., 0].sum(axis=1, dtype=float) ** 2).sum() for shard in (a, b)))
     assert noise < 0.015 * mine.sum()
     assert abs(mine.sum() - volpath.sum()) < 3.3 * noise
     # Both phase functions on their own, more coarsely: each has half of the points.

@@ -14,10 +14,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from deepclouds_training.clouds import make_cloud, scale_for_optical_depth
-from deepclouds_training.mitsuba_tracer import trace_walks_mitsuba
+from deepclouds_training.mitsuba_tracer import draw_directions, trace_walks_mitsuba
 from numpy.typing import NDArray
 
-from benchmarks.label_volpath import VolpathLabels, draw_directions
+from benchmarks.label_volpath import VolpathLabels
 from deepclouds.backend import backend
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
@@ -143,7 +143,7 @@ def label_maps(name: str, walks: int, batches: int) -> tuple[Floats, Floats]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CLOUDS)
-def test_labels_against_volpath(mono_mitsuba: ModuleType, name: str) -> None:
+def test_labels_against_volpath(scalar_mitsuba: ModuleType, name: str) -> None:
     """Image, tiles and points agree; a bias of 3 % either way would be noticed (5 % in the dense cloud), and a tile a fifth too bright."""
     first, second = label_maps(name, walks=768 if name == "dense cumulus" else 3072, batches=32)
     assert first.mean() > 0.02

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from deepclouds_training.mitsuba_tracer import scene_dict, trace_walks_mitsuba
+from deepclouds_training.mitsuba_tracer import VolpathScene, draw_directions, scene_dict, trace_walks_mitsuba
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -36,9 +36,9 @@ ALPHA = 1e-3
 
 
 @pytest.fixture(autouse=True)
-def mi(mono_mitsuba: ModuleType) -> ModuleType:
-    """Mitsuba under the one variant of these tests."""
-    return mono_mitsuba
+def mi(scalar_mitsuba: ModuleType) -> ModuleType:
+    """Mitsuba under the variant of the generator's labels; images ask for one that takes many camera rays at once."""
+    return scalar_mitsuba
 
 
 def cloud() -> tuple[Volume, float]:
@@ -177,6 +177,7 @@ def tracker_image(field: Field, rays: tuple[Singles, Singles], g: float, albedo:
 def images(mi: Any, name: str, g: float, albedo: float, sun: Singles, seeds: int, spp: int, size: int = 24) -> tuple[Floats, Floats]:
     """`seeds` images of the tracker and of volpath, (seeds, size, size) each."""
     volume, scale = VOLUMES[name]()
+    mi.set_variant("llvm_ad_mono")
     field, sensor = Field(backend(), volume, scale), camera(mi, size)
     scene = mi.load_dict(scene_dict(volume, scale, g, sun, albedo))
     first, second = [], []
@@ -235,9 +236,21 @@ def test_labels_are_refused_where_they_cannot_be_formed(mi: Any) -> None:
         trace_walks_mitsuba(volume, scale, points, w, single + 1, suns, one, 4, seed=1)
     empty = trace_walks_mitsuba(volume, 0.0, points, w, single, suns, one, 4, seed=1)
     np.testing.assert_array_equal(empty, np.zeros((1, 4, 1, 1)))
-    mi.set_variant("scalar_rgb")
+    mi.set_variant("scalar_spectral")
     with pytest.raises(InputError, match="set_variant"):
         trace_walks_mitsuba(volume, scale, points, w, single, suns, one, 4, seed=1)
+
+
+def test_meters_stand_at_their_points(mi: Any) -> None:
+    """Rays leave the very point, not a little beyond it, where a label in a dense cloud belongs to somewhere else."""
+    volume, scale = cloud()
+    points, w = np.array([[0.1, -0.2, 0.05], [0.3, 0.1, 0.0]], np.float32), unit_vectors(2, 79)
+    directions = draw_directions(np.random.default_rng(80), w, 0.5, 3)
+    (sensor,) = VolpathScene(volume, scale, 0.5).meters(points, directions, inside=True)
+    for i, (point, direction) in enumerate(zip(np.repeat(points, 3, axis=0), directions.reshape(-1, 3), strict=True)):
+        ray, _ = sensor.sample_ray(0.0, 0.0, mi.Point2f((i + 0.5) / 6, 0.5), mi.Point2f(0.5, 0.5))
+        np.testing.assert_allclose(np.array(ray.o), point, atol=1e-6)
+        np.testing.assert_allclose(np.array(ray.d), direction, atol=1e-6)
 
 
 def test_albedos_enter_both_alike() -> None:
@@ -258,13 +271,13 @@ def test_albedos_enter_both_alike() -> None:
 
 
 def test_variants_agree(mi: Any) -> None:
-    """Grey stays grey: the colour variant gives what the monochromatic one gives."""
+    """Grey stays grey: the scalar colour variant gives what the monochromatic one on all lanes gives."""
     volume, scale = cube()
     points, w = np.zeros((8, 3), np.float32), unit_vectors(8, 72)
     suns, albedo = np.broadcast_to(unit_vectors(1, 73), (8, 1, 3)), np.full((8, 1), 0.95, np.float32)
     single = np.full(8, 0.3, np.float32)
     means = []
-    for variant in ("llvm_ad_mono", "llvm_ad_rgb"):
+    for variant in ("scalar_rgb", "llvm_ad_mono"):
         mi.set_variant(variant)
         j = trace_walks_mitsuba(volume, scale, points, w, single, suns, albedo, 4096, seed=74).astype(np.float64)
         means.append((j.mean(), j.std() / np.sqrt(j.size)))

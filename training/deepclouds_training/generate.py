@@ -45,6 +45,9 @@ _MAKERS = 2
 _AHEAD = 3
 # Different suns, phase functions and albedos in a cloud that volpath can label: it needs a scene for each.
 _SHARED = 2
+# Mean free paths along a cloud beyond which volpath's share of the walks falls with the inverse square of the size: about so grow the
+# cost of its paths, whose majorant is global, and their number of scatterings.
+_VOLPATH_SIZE = 40.0
 
 
 def make_shard(
@@ -85,7 +88,8 @@ def make_shard(
 
     walks = _walks(config, plan, trace, n, (config.suns, albedo.shape[1]))
     if tracer == "mitsuba":
-        walks = np.maximum(GROUP, GROUP * np.round(config.volpath_walks * walks / GROUP)).astype(np.int64)
+        share = config.volpath_walks * min(1.0, _VOLPATH_SIZE / plan.size) ** 2
+        walks = np.maximum(GROUP, GROUP * np.round(share * walks / GROUP)).astype(np.int64)
     # The two tracers must not share a seed: what is compared has to be independent.
     final, seed = (trace, plan.walk_seed) if tracer == "own" else (trace_volpath, plan.walk_seed ^ 1)
     try:
@@ -269,7 +273,8 @@ def main(argv: Sequence[str], prog: str) -> int:
     if arguments.tracer == "mitsuba":
         import mitsuba as mi
 
-        mi.set_variant("llvm_ad_mono" if arguments.backend == "llvm" else "cuda_ad_mono")
+        # The fastest of its variants at this, and one that computes on all cores.
+        mi.set_variant("scalar_rgb")
     generate(load_config(arguments.config), arguments.output, arguments.tracer, arguments.backend, arguments.limit, part)
     dataset = open_dataset(arguments.output)
     points = sum(s.count for s in dataset.shards)

@@ -53,7 +53,8 @@ class GenerateConfig(BaseModel):
         one cloud in so many has points that share two suns, phase functions and albedos, so that ``--tracer mitsuba`` can label the
         same points; 0 for none.
     volpath_walks
-        share of a point's walks that volpath is given for each of its labels: its walks serve one label each, and are slower.
+        share of a point's walks that volpath is given for each of its labels, in clouds of up to 40 mean free paths; beyond, it falls
+        with the inverse square of the size. Its walks serve one label each, and are slower.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
