@@ -129,6 +129,22 @@ def read_exr(path: str | os.PathLike[str]) -> Exr:
         raise InputError(f"{name}: not a readable OpenEXR file ({error}); write it again") from error
 
 
+def read_attributes(path: str | os.PathLike[str]) -> dict[str, str | float | int]:
+    """Free attributes of an EXR file's header, without its pixels; raises InputError like `read_exr`."""
+    name = os.fspath(path)
+    if not os.path.isfile(name):
+        raise InputError(f"{name}: no such image file")
+    openexr = _openexr()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with openexr.File(name, header_only=True) as file:
+                header = dict(file.parts[0].header)
+    except Exception as error:
+        raise InputError(f"{name}: not a readable OpenEXR file ({error}); write it again") from error
+    return {k: v for k, v in header.items() if k not in _STRUCTURE and isinstance(v, str | int | float) and not isinstance(v, bool)}
+
+
 def _collect(path: str, parts: list[tuple[dict[str, object], dict[str, object]]]) -> Exr:
     channels: dict[str, NDArray[np.float32]] = {}
     attributes: dict[str, str | float | int] = {}

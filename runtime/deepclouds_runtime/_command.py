@@ -5,18 +5,15 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from deepclouds.errors import InputError
-
-if TYPE_CHECKING:
-    from deepclouds_runtime.renderer import Renderer, RenderResult
+from deepclouds_runtime._job import plan
+from deepclouds_runtime.sequence import parse_frames
 
 _PAIR = "AZ,EL"
 
@@ -53,14 +50,43 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds; with --progressive last, write its input first")
+    return value
+
+
+def _frames(text: str) -> tuple[int, ...]:
+    try:
+        return parse_frames(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _parser(prog: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=prog,
         description="Render a cloud: a Mitsuba 3 scene (.xml) or a volume (.vdb, .vol). The image is a float32 EXR, linear Rec. 709, "
         "with the light's parts as layers.",
     )
-    parser.add_argument("input", metavar="INPUT", help="scene.xml, cloud.vdb or cloud.vol")
-    parser.add_argument("-o", "--output", metavar="OUT.exr", type=Path, required=True, help="image to write")
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        nargs="+",
+        help="scene.xml, cloud.vdb or cloud.vol; a sequence of volumes as cloud_%%04d.vdb, cloud_####.vdb, a folder, or several files",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.exr",
+        type=Path,
+        required=True,
+        help="image to write; for several frames with %%04d or #### in the place of their number (default: OUT.0001.exr, ...)",
+    )
     parser.add_argument("--spp", type=_positive, help="samples a pixel (default: as many as --error asks for)")
     parser.add_argument("--error", type=float, help="noise of a pixel to aim at, as a share of the mean (default 0.02)")
     parser.add_argument(
@@ -83,6 +109,23 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument("--threads", type=_positive, help="threads to use (default: all cores)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--multiple", choices=("network", "walks"), default="network", help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--progressive",
+        metavar="SECONDS",
+        nargs="?",
+        type=_seconds,
+        const=1.0,
+        help="write the image while it is refined: a quick look first, then at most one each SECONDS (default %(const)g)",
+    )
+    parser.add_argument(
+        "--unit", type=float, help="unit of length of the network's input, world units (default: the mean free path at the mean extinction)"
+    )
+    several = parser.add_argument_group("several frames")
+    several.add_argument(
+        "--frames", metavar="LIST", type=_frames, help="of a sequence or a turn, as in 1-48, 1-48x2 or 1,5,9-12 (default: all)"
+    )
+    several.add_argument("--turntable", metavar="N", type=_positive, help="go once round the cloud in N frames, counted from 1")
+    several.add_argument("--skip-existing", "--resume", action="store_true", help="leave out frames whose image is there and finished")
     scene = parser.add_argument_group("a scene")
     scene.add_argument("-D", dest="defines", metavar="KEY=VALUE", action="append", default=[], help="value for a parameter of the scene")
     scene.add_argument("--sensor", type=int, help="number of the camera, from 0 (default 0)")
@@ -117,17 +160,9 @@ _MAY_BE_NEGATIVE = ("--phase", "--sun", "--view", "--albedo", "--irradiance", "-
 
 
 def run(argv: Sequence[str], prog: str) -> int:
-    """Parse `argv`, render and write; returns 0, raises InputError for bad input."""
+    """Parse `argv`, render and write; returns 0, or 130 when it was interrupted; raises InputError for bad input."""
     arguments = _parser(prog).parse_args(_negative_pairs(argv))
-    output: Path = arguments.output
-    png = None if arguments.png is None else Path(arguments.png or output.with_suffix(".png"))
-    for path, suffix in ((output, ".exr"), (png, ".png")):
-        if path is None:
-            continue
-        if path.suffix.lower() != suffix:
-            raise InputError(f"{path}: the name must end in {suffix}")
-        if not path.parent.is_dir():
-            raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
+    made = plan(arguments)
     options: dict[str, Any] = {k: getattr(arguments, k) for k in (*_VOLUME, *_BOTH, "sensor", "grid") if getattr(arguments, k) is not None}
     if arguments.clamp:
         options["clamp"] = True
@@ -137,62 +172,30 @@ def run(argv: Sequence[str], prog: str) -> int:
     if arguments.env_directions is not None:
         how["environment_directions"] = arguments.env_directions
 
-    import numpy as np
+    if arguments.unit is not None:
+        how["unit"] = arguments.unit
 
-    from deepclouds_runtime._mitsuba import mitsuba, select
-    from deepclouds_runtime.loading import load
-    from deepclouds_runtime.output import check_exposure, save
+    from deepclouds_runtime._job import run as run_job
+    from deepclouds_runtime._mitsuba import select
+    from deepclouds_runtime.output import check_exposure
 
     check_exposure(arguments.exposure)
     if arguments.variant is not None:
         select(arguments.variant)
     defines = dict(_define(text) for text in arguments.defines)
-    renderer = load(arguments.input, defines=defines, model=arguments.model, threads=arguments.threads, **options, **how)
-    say: Callable[[str], None] = (lambda text: None) if arguments.quiet else print
-    _describe(renderer, say)
-    with _progress(arguments.quiet) as progress:
-        dial = {} if arguments.error is None else {"error": arguments.error}
-        result = renderer.render(arguments.spp, arguments.seed, progress, **dial)
-    sensor = renderer.scene.sensor
-    parameters = mitsuba().traverse(sensor)
-    camera: dict[str, Any] = {
-        "type": sensor.class_name(),
-        "to_world": np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4).tolist(),
-        "film": [int(v) for v in sensor.film().size()],
-        "crop_offset": [int(v) for v in sensor.film().crop_offset()],
-    }
-    for name in ("x_fov", "aperture_radius", "focus_distance"):
-        if name in parameters:
-            camera[name] = [float(v) for v in np.ravel(np.array(parameters[name]))]
-    settings = {
+    record = {
         "command": shlex.join([*prog.split(), *argv]),
         "version": version("deepclouds"),
-        "mitsuba_variant": mitsuba().variant(),
-        "input": arguments.input,
-        "spp": result.statistics.spp,
         "error": arguments.error,
         "seed": arguments.seed,
         "defines": defines,
         "options": options,
+        "turntable": made.turntable,
         **how,
-        "environment_directions": renderer.environment_directions,
-        "size": renderer.scene.size,
-        "camera": camera,
-        "suns": [asdict(sun) for sun in renderer.scene.suns],
-        "hide_emitters": renderer.scene.hide_emitters,
-        "extinction": renderer.scene.scale,
-        "albedo": renderer.scene.albedo,
-        "phase": renderer.scene.phase,
-        "max_depth": renderer.scene.max_depth,
-        "model_hash": renderer.model_hash,
     }
-    save(result, output, settings, png, arguments.exposure)
-    _report(result, say)
-    for note in result.notes:
-        if note not in renderer.notes:
-            say(f"warning: {note}")
-    say(f"wrote {output}" + (f" and {png}" if png is not None else ""))
-    return 0
+    say: Callable[[str], None] = (lambda text: None) if arguments.quiet else partial(print, flush=True)
+    load = {"defines": defines, "model": arguments.model, "threads": arguments.threads, **options, **how}
+    return run_job(made, arguments, load, record, say)
 
 
 def _negative_pairs(argv: Sequence[str]) -> list[str]:
@@ -211,52 +214,3 @@ def _define(text: str) -> tuple[str, str]:
     if not name or not equals:
         raise InputError(f"-D{text}: write -DNAME=VALUE")
     return name, value
-
-
-def _describe(renderer: Renderer, say: Callable[[str], None]) -> None:
-    scene = renderer.scene
-    x, y, z = scene.volume.resolution
-    width, height = scene.size
-    albedo = ", ".join(f"{a:g}" for a in scene.albedo)
-    say(f"cloud of {x} x {y} x {z} voxels, extinction {scene.scale:.5g} at density 1, albedo {albedo}, {_phase_words(scene.phase)}")
-    lights = [f"{len(scene.suns)} sun{'s' if len(scene.suns) > 1 else ''}"] if scene.suns else []
-    lights += [scene.environment.class_name()] if scene.environment is not None else []
-    say(f"image of {width} x {height} pixels; lights: {', '.join(lights) or 'none'}")
-    for note in renderer.notes:
-        say(f"note: {note}")
-
-
-def _phase_words(phase: tuple[float, float, float]) -> str:
-    g1, g2, weight = phase
-    return f"g {g1:g}" if weight == 1 else f"g {g1:g} and {g2:g} with weights {weight:g} and {1 - weight:g}"
-
-
-def _report(result: RenderResult, say: Callable[[str], None]) -> None:
-    statistics = result.statistics
-    rows = [("mode", statistics.mode), ("samples a pixel", f"up to {statistics.spp:,}, on average {statistics.mean_spp:.3g}")]
-    if statistics.noise is not None:
-        rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
-    if statistics.network:
-        rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
-    for name, source in statistics.sources.items():
-        took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
-        rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
-    rows += [(name.replace("_", " "), f"{value:,}") for name, value in asdict(result.counts).items() if name != "skipped"]
-    rows += [(f"no query: {name}", f"{value:,}") for name, value in statistics.skipped.items()]
-    rows += [(f"time: {name}", f"{seconds:.2f} s") for name, seconds in result.seconds.items()]
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        say(f"{name.ljust(width)}  {value}")
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("rendering", total=1.0)
-        yield lambda share: bar.update(task, completed=share)

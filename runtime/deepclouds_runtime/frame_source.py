@@ -208,7 +208,7 @@ def frame_source(
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
-    lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, root * network.descriptor.unit)
+    lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, root * network.descriptor.unit, network.anchor)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
     checks = min(max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes))), len(seen.points) // 2)

@@ -11,13 +11,14 @@ from typing import Any
 from deepclouds.errors import InputError
 from deepclouds.volume import read_volume
 from deepclouds_runtime._mitsuba import mitsuba
+from deepclouds_runtime.key_frames import Fixed, with_extinction
 from deepclouds_runtime.renderer import Renderer
 from deepclouds_runtime.scattering import Predicts
 from deepclouds_runtime.scene import CloudScene, read_scene
 from deepclouds_runtime.volume_scene import options_from, volume_scene
 
 # How a render is done, whatever the input.
-RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection", "extrapolate")
+RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection", "extrapolate", "unit")
 _MOST_THREADS = 1024
 SCENE_OPTIONS = ("sensor", "max_depth", "hide_emitters")
 
@@ -31,6 +32,8 @@ def load(
     threads: int | None = None,
     grid: str | None = None,
     clamp: bool = False,
+    fixed: Fixed | None = None,
+    turn: int = 1,
     **options: Any,
 ) -> Renderer:
     """Load what can be rendered.
@@ -49,10 +52,14 @@ def load(
         threads for everything; None takes all cores.
     grid, clamp
         name of the grid in a .vdb file; set negative values and NaN to 0.
+    fixed
+        what stays the same over the sequence that a volume belongs to, see `deepclouds_runtime.key_frames`.
+    turn
+        frames of a full turn around a volume, all of which the camera's distance suits, see `deepclouds_runtime.turntable`.
     **options
         for a volume: the fields of `deepclouds_runtime.volume_scene.VolumeOptions`; for a scene: ``sensor``, ``max_depth``,
-        ``hide_emitters``; for both: ``mode``, ``multiple``, ``environment_directions``, ``interreflection``, ``extrapolate`` (see
-        `Renderer`).
+        ``hide_emitters``; for both: ``mode``, ``multiple``, ``environment_directions``, ``interreflection``, ``extrapolate``,
+        ``unit`` (see `Renderer`).
 
     Returns
     -------
@@ -77,13 +84,15 @@ def load(
     mitsuba(select=is_path)
     if threads is not None:
         _set_threads(threads)
-    scene = _scene(source, path, dict(defines or {}), grid, clamp, options)
+    scene = _scene(source, path, dict(defines or {}), grid, clamp, fixed, turn, options)
     if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
         from deepclouds.volume.pyramid import optical_size
         from deepclouds_runtime.predictor import predictor_for
 
-        size = optical_size(scene.volume, scene.scale)
+        size = optical_size(scene.volume, scene.scale) if fixed is None else fixed.size
         predictor = predictor_for(None if model is None else fspath(model), scene.phase, scene.albedo, size, threads)
+    if fixed is not None:
+        how = {"unit": fixed.unit, "origin": fixed.origin, **how}
     return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)
 
 
@@ -97,11 +106,23 @@ def _set_threads(threads: int) -> None:
     dr.set_thread_count(threads)
 
 
-def _scene(source: Any, path: Path | None, defines: dict[str, str], grid: str | None, clamp: bool, options: dict[str, Any]) -> CloudScene:
+def _scene(
+    source: Any,
+    path: Path | None,
+    defines: dict[str, str],
+    grid: str | None,
+    clamp: bool,
+    fixed: Fixed | None,
+    turn: int,
+    options: dict[str, Any],
+) -> CloudScene:
     if path is not None and path.suffix.lower() in (".vdb", ".vol"):
         if defines:
             raise InputError(f"{path}: -D{next(iter(defines))} has no meaning for a volume; it sets a parameter of a scene file")
-        return volume_scene(read_volume(path, grid, clamp), options_from(options), str(path))
+        wanted = options_from(options)
+        if fixed is None:
+            return volume_scene(read_volume(path, grid, clamp), wanted, str(path), turn=turn)
+        return volume_scene(read_volume(path, grid, clamp), with_extinction(wanted, fixed), str(path), fixed.corners, turn)
     if path is not None and path.suffix.lower() != ".xml":
         raise InputError(f"{path}: deepclouds renders Mitsuba scenes (.xml) and volumes (.vdb, .vol), not '{path.suffix}'")
     unknown = sorted(set(options) - set(SCENE_OPTIONS))

@@ -7,6 +7,7 @@ interpolations differ by about the error that was allowed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -79,12 +80,21 @@ class Statistics:
     error: float = 0.0
 
 
-def lattice_around(lengths: Array, corner: Array, axes: Array, spacing: float) -> Lattice:
+def lattice_around(lengths: Array, corner: Array, axes: Array, spacing: float, anchor: Array | None = None) -> Lattice:
     """Lattice that covers a box with edges `lengths` along `axes` from `corner`, of cells of about `spacing`.
 
-    There are at least two cells along the longest edge, and at most `_MOST_CELLS_A_SIDE`.
+    There are at least two cells along the longest edge, and at most `_MOST_CELLS_A_SIDE`. With an `anchor`, a world point, cells have their
+    corners at whole multiples of their edge from it, and the edge is `spacing` times a power of two: boxes that change a little from frame
+    to frame then have their nodes in the same places.
     """
     longest = float(lengths.max())
+    if anchor is not None:
+        most = longest / (_MOST_CELLS_A_SIDE - 1)
+        spacing *= 2.0 ** max(math.ceil(math.log2(most / spacing)), min(math.floor(math.log2(longest / 2 / spacing)), 0))
+        local = axes.T @ (corner - anchor) / spacing
+        first = np.floor(local + 1e-6)
+        size = np.maximum(np.ceil(local + lengths / spacing - 1e-6) - first, 1).astype(np.int64)
+        return Lattice(anchor + axes @ (first * spacing), axes, spacing, size)
     spacing = float(np.clip(spacing, longest / _MOST_CELLS_A_SIDE, longest / 2))
     size = np.maximum(np.ceil(lengths / spacing - 1e-6), 1).astype(np.int64)
     # The box stands in the middle of its cells.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from deepclouds.errors import InputError
-from deepclouds.exr import write_exr, write_png
+from deepclouds.exr import read_attributes, write_exr, write_png
 from deepclouds_runtime.renderer import RenderResult
 
 ATTRIBUTE = "deepclouds"
@@ -22,6 +22,18 @@ def check_exposure(stops: float) -> None:
     """Refuse, by InputError, an exposure that turns every image black, white, or into NaN."""
     if not -_MOST_STOPS <= stops <= _MOST_STOPS:
         raise InputError(f"exposure = {stops:g}: give stops between -{_MOST_STOPS} and {_MOST_STOPS}")
+
+
+def is_complete(path: str | PathLike[str]) -> bool:
+    """Whether an image is there whole: false for one of ours that was written on the way or interrupted, and for what cannot be read.
+
+    Images that others wrote count as whole.
+    """
+    try:
+        stored = read_attributes(path).get(ATTRIBUTE)
+    except InputError:
+        return False
+    return stored is None or bool(json.loads(str(stored)).get("statistics", {}).get("complete", True))
 
 
 def save(

@@ -157,6 +157,8 @@ class Renderer:
         ``"reference"``: the method as published, where every sample asks the network.
     extrapolate
         whether the network is asked about media that it was not trained on; by default J then comes from walks.
+    unit, origin
+        of the descriptor, see `deepclouds.descriptor.Descriptor`: fixed for a sequence of frames; by default those of the cloud.
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
@@ -166,11 +168,13 @@ class Renderer:
         what was approximated in reading the scene, and what of its medium the model was not trained on, in sentences.
     model_hash
         of the weights that are asked, or None.
+    predictor
+        the network that was given.
 
     Raises
     ------
     InputError
-        for an unknown `multiple`.
+        for an unknown `multiple` and a unit of length that is none.
     """
 
     def __init__(
@@ -183,6 +187,8 @@ class Renderer:
         interreflection: bool = True,
         mode: str = "fast",
         extrapolate: bool = False,
+        unit: float | None = None,
+        origin: NDArray[np.float64] | None = None,
         load_seconds: float = 0.0,
     ) -> None:
         if mode not in MODES:
@@ -191,17 +197,20 @@ class Renderer:
             raise InputError(f"multiple = '{multiple}': J comes from 'network' or 'walks'")
         if environment_directions < 1:
             raise InputError(f"environment directions = {environment_directions}: at least one is drawn at each sample")
+        if unit is not None and not (math.isfinite(unit) and unit > 0):
+            raise InputError(f"unit = {unit:g}: give a length in world units, about the mean free path in the cloud")
         started = time.perf_counter()
         self.scene = scene
         self._multiple, self.mode = multiple, mode
         self.environment_directions = environment_directions
+        self.predictor = predictor
         self._types = types_of(mitsuba())
         self._field = Field(self._types, scene.volume, scene.scale)
         self._network: NetworkScattering | None = None
         if scene.max_depth != 2 and multiple == "network":
             if predictor is None:
                 raise InputError("multiple scattering needs a model; give one, or render single scattering alone (max_depth 2)")
-            self._network = NetworkScattering(self._field, predictor)
+            self._network = NetworkScattering(self._field, predictor, unit, origin)
         # Single scattering alone stops before light that surfaces have reflected, as volpath with max_depth 2 does.
         self._interreflection = interreflection and scene.surfaces is not None and scene.max_depth != 2
         self.notes = scene.notes
@@ -214,6 +223,11 @@ class Renderer:
         if self._network is not None:
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
+
+    @property
+    def unit(self) -> float | None:
+        """Unit of length of the network's input, world units; None where no network is asked."""
+        return None if self._network is None else self._network.descriptor.unit
 
     def samples(self, spp: int | None) -> int:
         """Samples a pixel of a render that is asked for `spp`; for None those of the camera's sampler."""
@@ -232,6 +246,7 @@ class Renderer:
         error: float = ERROR,
         partial: Callable[[RenderResult], None] | None = None,
         interrupted: Callable[[], bool] | None = None,
+        estimate: Callable[[float], None] | None = None,
     ) -> RenderResult:
         """Render an image.
 
@@ -252,6 +267,8 @@ class Renderer:
         interrupted
             is asked between passes whether to stop. The image is then made of what there is, of one sample of every pixel at least, and
             its statistics are not ``complete``.
+        estimate
+            is called with the estimated noise after each round.
 
         Raises
         ------
@@ -303,6 +320,8 @@ class Renderer:
                 if stopped:
                     break
                 noise, _ = work.settle(before, done, error, rest=False)
+                if estimate is not None:
+                    estimate(noise)
         else:
             asked = int(scene.sensor.sampler().sample_count())
             _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
@@ -316,6 +335,8 @@ class Renderer:
                 if stopped:
                     break
                 noise, growth = work.settle(before, done, error)
+                if estimate is not None:
+                    estimate(noise)
                 if progress is not None:
                     progress(min(error / max(noise, 1e-9), 1.0) ** 2)
         return self._result(work, started, noise, not stopped)

@@ -64,6 +64,8 @@ class NetworkScattering:
 
     def __init__(self, field: Field, predictor: Predicts, unit: float | None = None, origin: NDArray[np.float64] | None = None) -> None:
         self.descriptor = Descriptor(field, unit, origin)
+        # What is built on the field is aligned to it too.
+        self.anchor = origin
         self.predictor = predictor
         self._types = field.types
         trusted = getattr(getattr(predictor, "metadata", None), "trust", None) is not None

@@ -86,7 +86,9 @@ class VolumeOptions:
 NAMES = tuple(f.name for f in fields(VolumeOptions))
 
 
-def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudScene:
+def volume_scene(
+    volume: Volume, options: VolumeOptions, source: str, corners: NDArray[np.float64] | None = None, turn: int = 1
+) -> CloudScene:
     """Light `volume` and put a camera before it.
 
     Parameters
@@ -97,6 +99,10 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
         see `VolumeOptions`.
     source
         the file, for messages.
+    corners
+        (n, 3) world points that the camera frames, in place of the volume's own.
+    turn
+        views around the cloud, one full turn, that the camera's distance suits; with more than one it looks at `pivot`.
 
     Raises
     ------
@@ -108,7 +114,7 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
     scale = extinction(volume, options, source)
     try:
         # One by one: a scene around them would ask a GPU for its ray tracer.
-        parts = {name: mi.load_dict(part) for name, part in description(volume, options).items() if name != "type"}
+        parts = {name: mi.load_dict(part) for name, part in description(volume, options, corners, turn).items() if name != "type"}
     except RuntimeError as error:
         if "envmap" in str(error):
             raise InputError(f"{options.env}: not an environment map that Mitsuba reads; give a latitude-longitude .exr or .hdr") from error
@@ -132,11 +138,11 @@ def volume_scene(volume: Volume, options: VolumeOptions, source: str) -> CloudSc
     )
 
 
-def description(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
+def description(volume: Volume, options: VolumeOptions, corners: NDArray[np.float64] | None = None, turn: int = 1) -> dict[str, Any]:
     """Camera and lights as a dictionary for ``mitsuba.load_dict``, in any variant; raises InputError for a missing environment map."""
     import mitsuba as mi
 
-    scene: dict[str, Any] = {"type": "scene", "camera": _camera(volume, options)}
+    scene: dict[str, Any] = {"type": "scene", "camera": _camera(framed_corners(volume) if corners is None else corners, options, turn)}
     sun = options.sun if options.sun is not None or options.env is not None else _DEFAULT_SUN
     if sun is not None and max(options.irradiance) > 0:
         scene["sun"] = {
@@ -271,30 +277,51 @@ def _direction(angles: tuple[float, float], up: str) -> NDArray[np.float64]:
     return vector
 
 
-def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
-    """Perspective camera as near as the filled voxels allow."""
-    import mitsuba as mi
+def pivot(corners: NDArray[np.float64], up: str) -> NDArray[np.float64]:
+    """World point (3,) that a camera looks at that goes round what fills `corners` (n, 3): the middle of the box along the axes."""
+    axes = _axes(up)
+    along = corners @ axes.T
+    middle: NDArray[np.float64] = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ axes
+    return middle
 
-    toward = _direction(options.view, options.up)
-    forward = -toward
-    up = _axes(options.up)[2]
-    if abs(up @ toward) > 0.9999:
-        up = _axes(options.up)[0]
-    right = np.cross(forward, up)
+
+def _basis(view: tuple[float, float], up: str) -> NDArray[np.float64]:
+    """Rows: to the right, upward in the picture, and away from the camera."""
+    toward = _direction(view, up)
+    vertical = _axes(up)[2]
+    if abs(vertical @ toward) > 0.9999:
+        vertical = _axes(up)[0]
+    right = np.cross(-toward, vertical)
     right /= np.linalg.norm(right)
-    above = np.cross(right, forward)
-    corners = _framed_corners(volume)
-    # In the middle of what the picture shows, which is seldom that of the box.
-    basis = np.stack([right, above, forward])
-    along = corners @ basis.T
-    middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ basis
-    relative = corners - middle
-    width, height = options.size
+    return np.stack([right, np.cross(right, -toward), -toward])
+
+
+def _distance(relative: NDArray[np.float64], basis: NDArray[np.float64], size: tuple[int, int]) -> float:
+    """Distance from which all places (n, 3), relative to what the camera looks at, are in the picture."""
+    width, height = size
     tangent = np.tan(np.deg2rad(_FOV / 2))
     # Mitsuba's fov spans the larger side with fov_axis = larger.
     tan_x, tan_y = tangent * width / max(width, height), tangent * height / max(width, height)
-    reach = np.maximum(np.abs(relative @ right) / tan_x, np.abs(relative @ above) / tan_y)
-    distance = float((_MARGIN * reach - relative @ forward).max())
+    x, y, z = basis @ relative.T
+    return float((_MARGIN * np.maximum(np.abs(x) / tan_x, np.abs(y) / tan_y) - z).max())
+
+
+def _camera(corners: NDArray[np.float64], options: VolumeOptions, turn: int) -> dict[str, Any]:
+    """Perspective camera as near as the world points `corners` (n, 3) allow, in each of `turn` views around them."""
+    import mitsuba as mi
+
+    azimuth, elevation = options.view
+    basis = _basis(options.view, options.up)
+    if turn > 1:
+        middle = pivot(corners, options.up)
+        views = [_basis((azimuth + 360 * k / turn, elevation), options.up) for k in range(turn)]
+    else:
+        # In the middle of what the picture shows, which is seldom that of the box.
+        along = corners @ basis.T
+        middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ basis
+        views = [basis]
+    distance = max(_distance(corners - middle, view, options.size) for view in views)
+    width, height = options.size
     film = {
         "type": "hdrfilm",
         "width": int(width),
@@ -308,13 +335,15 @@ def _camera(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
         "fov_axis": "larger",
         "near_clip": 1e-4 * distance,
         "far_clip": 1e3 * distance,
-        "to_world": mi.ScalarTransform4f().look_at(origin=(middle + toward * distance).tolist(), target=middle.tolist(), up=up.tolist()),
+        "to_world": mi.ScalarTransform4f().look_at(
+            origin=(middle - basis[2] * distance).tolist(), target=middle.tolist(), up=basis[1].tolist()
+        ),
         "film": film,
         "sampler": {"type": "independent", "sample_count": int(options.spp)},
     }
 
 
-def _framed_corners(volume: Volume) -> NDArray[np.float64]:
+def framed_corners(volume: Volume) -> NDArray[np.float64]:
     """World corners (n, 3) of the voxels at the ends of each row along x that holds something; of the box when all are empty."""
     rows, first, last = volume.row_ends(_FRAMED * volume.stored.max(initial=0))
     if len(rows):

@@ -1,0 +1,88 @@
+"""What `deepclouds render` says about a render, on the terminal and in the image's header."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from deepclouds_runtime.renderer import Renderer, RenderResult
+
+
+def describe(renderer: Renderer, say: Callable[[str], None]) -> None:
+    """Say what will be rendered."""
+    scene = renderer.scene
+    x, y, z = scene.volume.resolution
+    width, height = scene.size
+    albedo = ", ".join(f"{a:g}" for a in scene.albedo)
+    say(f"cloud of {x} x {y} x {z} voxels, extinction {scene.scale:.5g} at density 1, albedo {albedo}, {_phase_words(scene.phase)}")
+    lights = [f"{len(scene.suns)} sun{'s' if len(scene.suns) > 1 else ''}"] if scene.suns else []
+    lights += [scene.environment.class_name()] if scene.environment is not None else []
+    say(f"image of {width} x {height} pixels; lights: {', '.join(lights) or 'none'}")
+    for note in renderer.notes:
+        say(f"note: {note}")
+
+
+def report(result: RenderResult, say: Callable[[str], None]) -> None:
+    """Say what a render took, as a table."""
+    statistics = result.statistics
+    rows = [("mode", statistics.mode), ("samples a pixel", f"up to {statistics.spp:,}, on average {statistics.mean_spp:.3g}")]
+    if statistics.noise is not None:
+        rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
+    if statistics.network:
+        rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
+    for name, source in statistics.sources.items():
+        took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
+        rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
+    rows += [(name.replace("_", " "), f"{value:,}") for name, value in asdict(result.counts).items() if name != "skipped"]
+    rows += [(f"no query: {name}", f"{value:,}") for name, value in statistics.skipped.items()]
+    rows += [(f"time: {name}", f"{seconds:.2f} s") for name, seconds in result.seconds.items()]
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        say(f"{name.ljust(width)}  {value}")
+
+
+def settings(renderer: Renderer) -> dict[str, Any]:
+    """Of the scene, what is needed to render the image again."""
+    import numpy as np
+
+    from deepclouds_runtime._mitsuba import mitsuba
+
+    scene = renderer.scene
+    parameters = mitsuba().traverse(scene.sensor)
+    camera: dict[str, Any] = {
+        "type": scene.sensor.class_name(),
+        "to_world": np.array(scene.sensor.world_transform().matrix, np.float64).reshape(4, 4).tolist(),
+        "film": [int(v) for v in scene.sensor.film().size()],
+        "crop_offset": [int(v) for v in scene.sensor.film().crop_offset()],
+    }
+    for name in ("x_fov", "aperture_radius", "focus_distance"):
+        if name in parameters:
+            camera[name] = [float(v) for v in np.ravel(np.array(parameters[name]))]
+    return {
+        "mitsuba_variant": mitsuba().variant(),
+        "environment_directions": renderer.environment_directions,
+        "size": scene.size,
+        "camera": camera,
+        "suns": [asdict(sun) for sun in scene.suns],
+        "hide_emitters": scene.hide_emitters,
+        "extinction": scene.scale,
+        "unit": renderer.unit,
+        "albedo": scene.albedo,
+        "phase": scene.phase,
+        "max_depth": scene.max_depth,
+        "model_hash": renderer.model_hash,
+    }
+
+
+def noise_words(result: RenderResult) -> str:
+    """Samples and noise of an image in a few words."""
+    statistics = result.statistics
+    noise = "" if statistics.noise is None else f", noise of about {100 * statistics.noise:.2g} %"
+    return f"{statistics.mean_spp:.3g} samples a pixel{noise}"
+
+
+def _phase_words(phase: tuple[float, float, float]) -> str:
+    g1, g2, weight = phase
+    return f"g {g1:g}" if weight == 1 else f"g {g1:g} and {g2:g} with weights {weight:g} and {1 - weight:g}"
