@@ -11,7 +11,9 @@ from deepclouds.replacing import replacing
 
 PICTURE = "images/ablations.png"
 LINK = f"![Change of the error against the base, and error against cost]({PICTURE})"
-# Key in the results, heading, factor, signed.
+# Medians above this, in percent, would squeeze the others.
+WORST_DRAWN = 20.0
+# Key in the results, heading, signed.
 COLUMNS = (
     ("halves rRMSE", "rRMSE, halves", False),
     ("converged rRMSE", "rRMSE, converged", False),
@@ -65,36 +67,46 @@ def _cell(row: dict[str, Any], key: str, signed: bool) -> str:
     return f"{values.mean():{'+' if signed else ''}.2f} +- {0.5 * np.ptp(values):.2f}"
 
 
-def draw(results: dict[str, Any], path: Path) -> None:
-    """Left: change against the base, a dot a seed. Right: error against processor time a query."""
+def draw(found: list[dict[str, Any]], path: Path) -> None:
+    """Left: change against the base of the same run, a dot a seed. Right: error against processor time a query."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    rows = results["rows"]
-    base = next(r for r in rows if r["name"] == results["base"])
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 0.26 * len(rows) + 1.2), width_ratios=[1.1, 1])
-    groups = list(dict.fromkeys(r["group"] for r in rows))
-    colours = {g: f"C{i}" for i, g in enumerate(groups)}
-    for place, row in enumerate(rows):
+    bases = [next(r for r in results["rows"] if r["name"] == results["base"]) for results in found]
+    rows = [
+        (row, base)
+        for results, base in zip(found, bases, strict=True)
+        for row in results["rows"]
+        if row is base or row["name"] != base["name"]
+    ]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 0.24 * len(rows) + 1.2), width_ratios=[1.1, 1])
+    colours = {g: f"C{i}" for i, g in enumerate(dict.fromkeys(row["group"] for row, _ in rows))}
+    for place, (row, base) in enumerate(rows):
         for seed in row["seeds"]:
-            mean, _ = change({**row, "seeds": [seed]}, base)
-            left.plot(100 * mean, -place, "o", color=colours[row["group"]])
+            left.plot(100 * change({**row, "seeds": [seed]}, base)[0], -place, "o", color=colours[row["group"]])
     left.axvline(0, color="0.6", lw=1)
-    left.set_yticks([-i for i in range(len(rows))], [r["name"] for r in rows])
-    left.set_xscale("symlog", linthresh=10)
+    left.set_yticks([-i for i in range(len(rows))], [row["name"] for row, _ in rows])
+    left.set_xscale("symlog", linthresh=40)
+    marks = [-20, -10, 0, 10, 20, 40, 100, 200]
+    left.set_xticks(marks, [str(m) for m in marks])
     left.set_xlabel("change of the errors against the base, % (below 0 is better)")
     left.grid(axis="x", alpha=0.3)
-    for row in rows:
-        if row["group"] in ("base", "width", "levels", "small networks") or row["name"] == "symmetric":
-            error = 100 * np.mean([s["halves rRMSE"] for s in row["seeds"]])
-            right.plot(1e6 * row["seconds"], error, "o", color=colours[row["group"]])
-            right.annotate(row["name"], (1e6 * row["seconds"], error), xytext=(4, 3), textcoords="offset points", fontsize=8)
+    for row, _ in rows:
+        error = 100 * np.mean([s["median"] for s in row["seeds"]])
+        if error < WORST_DRAWN:
+            right.plot(1e6 * row["seconds"], error, "o", color=colours[row["group"]], label=row["group"])
+            right.annotate(row["name"], (1e6 * row["seconds"], error), xytext=(4, 3), textcoords="offset points", fontsize=7)
+    handles = dict(zip(*reversed(right.get_legend_handles_labels()), strict=True))
+    right.legend(handles.values(), handles.keys(), fontsize=8)
     right.set_xscale("log")
+    costs = [1, 2, 4, 8]
+    right.set_xticks(costs, [str(c) for c in costs])
+    right.minorticks_off()
     right.set_xlabel("processor time a query, microseconds")
-    right.set_ylabel("noise-free rRMSE on held-out clouds (halves), %")
-    right.grid(alpha=0.3, which="both")
+    right.set_ylabel("median relative error on held-out clouds (converged), %")
+    right.grid(alpha=0.3)
     figure.tight_layout()
     with replacing(path, ".png") as temporary:
         figure.savefig(temporary, dpi=100)

@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 PAGE = Path("docs/ablations.md")
 HELD_OUT = (Path("work/valid_converged"), Path("work/valid_halves"))
 RESULTS = "results.json"
+TITLES = {"separate": "One departure at a time", "together": "What won, together"}
 LARGE = NetworkConfig(width=192, compression="root")
 
 
@@ -41,12 +42,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if options.docs:
-        paths = [options.output / name / RESULTS for name in SETS]
-        found = [json.loads(path.read_text()) for path in paths if path.exists()]
+        paths = {name: options.output / name / RESULTS for name in SETS}
+        found = {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}
         if not found:
-            raise InputError(f"{paths[0]}: no results yet; run without --docs first")
-        draw(found, PAGE.parent / PICTURE)
-        write_results(PAGE, "ablations", "\n\n".join([*(body(results) for results in found), LINK]))
+            raise InputError(f"{options.output}: no results yet; run without --docs first")
+        draw(list(found.values()), PAGE.parent / PICTURE)
+        write_results(PAGE, "ablations", "\n\n".join([*(f"## {TITLES[name]}\n\n{body(r)}" for name, r in found.items()), LINK]))
         return 0
     plan = Plan(options.data, options.minutes, shards=options.shards)
     learners = [Learner(v, seed, plan) for v in SETS[options.set] for seed in range(options.seeds)]

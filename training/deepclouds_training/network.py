@@ -292,7 +292,10 @@ class Network(nn.Module):
         """What each block of pooled levels reads, standardised, (n, channels * together), by its first level."""
         assert self.pooling is not None
         config = self.config
-        read = stencil if config.levels == tuple(range(LEVELS)) else stencil[:, list(config.levels)]
+        step = config.levels[1] - config.levels[0] if len(config.levels) > 1 else 1
+        even = range(config.levels[0], config.levels[-1] + 1, step)
+        # A slice costs less than a gathering of levels, and nothing where it is the whole stencil.
+        read = stencil[:, even.start : even.stop : step] if tuple(even) == config.levels else stencil[:, list(config.levels)]
         means = torch.unbind(self.pooling(read).float(), dim=1)
         ready = [(self.compressed(x, k) - self.level_mean[k]) * self.level_scale[k] for k, x in zip(config.levels, means, strict=True)]
         n = config.together
