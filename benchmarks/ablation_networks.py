@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from deepclouds_training.network import FEATURES, HIGHEST, LOWEST, Block, Network, NetworkConfig
+from deepclouds_training.features import FEATURES
+from deepclouds_training.network import HIGHEST, LOWEST, Block, Network, NetworkConfig
 from torch import Tensor, nn
 from torch.nn import functional as F
 

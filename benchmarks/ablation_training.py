@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import torch
 from deepclouds_training.average import WeightAverage
+from deepclouds_training.features import AngleFeatures
 from deepclouds_training.loss import relative_squared_error
-from deepclouds_training.network import AngleFeatures, Network, NetworkConfig
+from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.samples import SampleConfig, Samples
 from deepclouds_training.shards import open_dataset
 from numpy.typing import NDArray

@@ -43,6 +43,10 @@ def _plain(width: int = 64, **fields: object) -> Callable[[], Network]:
     return lambda: Network(_config(width, **fields))
 
 
+def _best(width: int = 64, **fields: object) -> Callable[[], Network]:
+    return _plain(width, **{"scale": "density", "head": "octaves", **fields})
+
+
 BASE = "base"
 FURNACE_WEIGHT = 0.2
 FAST = "small networks"
@@ -76,19 +80,18 @@ SEPARATE: tuple[Variant, ...] = (
     Variant("pooled blocks", FAST, "24 pooled values a level, then blocks of 36", _plain(36, channels=24)),
 )
 
-_BEST: dict[str, object] = {"scale": "density", "head": "octaves"}
 EVEN = (0, 2, 4, 6, 8)
 
 # What won above, together; the first row is the base once more, for the comparison.
 TOGETHER: tuple[Variant, ...] = (
     Variant(BASE, "base", "as above", _plain()),
-    Variant("d + o", "together", "density, ratio to octaves", _plain(**_BEST)),
-    Variant("d + o + s", "together", "density, ratio to octaves, symmetric", _plain(**_BEST, symmetric=True)),
-    Variant("d + o + log", "together", "density, ratio to octaves, logarithm", _plain(**{**_BEST, "compression": "log"})),
-    Variant("d + o + s 128", "together", "density, ratio to octaves, symmetric, width 128", _plain(128, **_BEST, symmetric=True)),
-    Variant("pooled blocks d + o", FAST, "24 pooled values a level, blocks of 36, density, octaves", _plain(36, **_BEST, channels=24)),
-    Variant("pooled pairs", FAST, "16 pooled values a level, blocks of 40 for pairs", _plain(40, **_BEST, channels=16, together=2)),
-    Variant("pooled half 48", FAST, "16 pooled values of 5 levels, blocks of 48", _plain(48, **_BEST, channels=16, levels=EVEN)),
-    Variant("pooled half 40", FAST, "24 pooled values of 5 levels, blocks of 40", _plain(40, **_BEST, channels=24, levels=EVEN)),
+    Variant("d + o", "together", "density, ratio to octaves", _best()),
+    Variant("d + o + s", "together", "density, ratio to octaves, symmetric", _best(symmetric=True)),
+    Variant("d + o + log", "together", "density, ratio to octaves, logarithm", _best(compression="log")),
+    Variant("d + o + s 128", "together", "density, ratio to octaves, symmetric, width 128", _best(128, symmetric=True)),
+    Variant("pooled blocks d + o", FAST, "24 pooled values a level, blocks of 36, density, octaves", _best(36, channels=24)),
+    Variant("pooled pairs", FAST, "16 pooled values a level, blocks of 40 for pairs", _best(40, channels=16, together=2)),
+    Variant("pooled half 48", FAST, "16 pooled values of 5 levels, blocks of 48", _best(48, channels=16, levels=EVEN)),
+    Variant("pooled half 40", FAST, "24 pooled values of 5 levels, blocks of 40", _best(40, channels=24, levels=EVEN)),
 )
 SETS: dict[str, tuple[Variant, ...]] = {"separate": SEPARATE, "together": TOGETHER}

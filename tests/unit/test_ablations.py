@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from deepclouds_training.network import FEATURES, Network, NetworkConfig
+from deepclouds_training.features import FEATURES
+from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.samples import Samples
 from deepclouds_training.shards import Shard
 

@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from deepclouds_training.network import FEATURES, ORDERS, AngleFeatures, Network, NetworkConfig
+from deepclouds_training.features import FEATURES, ORDERS, AngleFeatures
+from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.pooling import mirrored_points
 from pydantic import ValidationError
 
