@@ -8,9 +8,10 @@ import threading
 import time
 from collections.abc import Callable
 from types import FrameType, TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from deepclouds_runtime.renderer import RenderResult
+if TYPE_CHECKING:
+    from deepclouds_runtime.renderer import RenderResult
 
 INTERRUPTED = 130
 """Exit code of a command that was stopped by a signal, whichever it was."""
@@ -25,7 +26,7 @@ class Interruption:
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._asked = False
+        self._asked = self._twice = False
         self._before: dict[int, Any] = {}
 
     def __call__(self) -> bool:
@@ -40,9 +41,13 @@ class Interruption:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        # What was running may have made an error of its own out of it.
+        if self._twice and error is not None and not isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._asked:
+            self._twice = True
             raise KeyboardInterrupt
         self._asked = True
         self._say("stopping after the running pass; once more stops at once, without the image")

@@ -18,6 +18,8 @@ def render(
     model: str | PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
     error: float = 0.02,
+    partial: Callable[[RenderResult], None] | None = None,
+    interrupted: Callable[[], bool] | None = None,
     **options: Any,
 ) -> RenderResult:
     """Render a cloud with its multiple scattering predicted by the network.
@@ -38,6 +40,10 @@ def render(
         is called with the share of the work done, 0 to 1.
     error
         noise of a pixel to aim at, root of the mean square over the mean.
+    partial
+        is called with the image so far, first with a quick look; see `deepclouds_runtime.renderer.Renderer.render`.
+    interrupted
+        is asked between passes whether to stop with what there is.
     **options
         see `deepclouds_runtime.loading.load`.
 
@@ -57,7 +63,7 @@ def render(
     """
     from deepclouds_runtime.loading import load
 
-    return load(input, defines=defines, model=model, **options).render(spp, seed, progress, error)
+    return load(input, defines=defines, model=model, **options).render(spp, seed, progress, error, partial, interrupted)
 
 
 def main(argv: Sequence[str], prog: str = "deepclouds render") -> int:
