@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from deepclouds.errors import InputError
-from deepclouds_runtime._job import plan
+from deepclouds_runtime._job import ERROR_OF_FRAMES, corrects, plan
 from deepclouds_runtime.sequence import parse_frames
 
 _PAIR = "AZ,EL"
@@ -88,7 +88,25 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         help="image to write; for several frames with %%04d or #### in the place of their number (default: OUT.0001.exr, ...)",
     )
     parser.add_argument("--spp", type=_positive, help="samples a pixel (default: as many as --error asks for)")
-    parser.add_argument("--error", type=float, help="noise of a pixel to aim at, as a share of the mean (default 0.02)")
+    parser.add_argument(
+        "--error",
+        type=float,
+        help=f"noise of a pixel to aim at, as a share of the mean (default 0.02; of several frames {ERROR_OF_FRAMES})",
+    )
+    parser.add_argument(
+        "--audit", action="store_true", help="measure the network's error in this image with path-traced walks, and report it (fast mode)"
+    )
+    parser.add_argument(
+        "--correct",
+        action=argparse.BooleanOptionalAction,
+        help="audit, and correct the network by what the walks say (default: for an image alone in the fast mode)",
+    )
+    parser.add_argument(
+        "--time",
+        type=float,
+        metavar="SECONDS",
+        help="the audit ends after half of them, sampling with the round in which they are over; the image then depends on the machine",
+    )
     parser.add_argument(
         "--mode", choices=("fast", "reference"), default="fast", help="reference: every sample asks the network (default %(default)s)"
     )
@@ -125,7 +143,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--frames", metavar="LIST", type=_frames, help="of a sequence or a turn, as in 1-48, 1-48x2 or 1,5,9-12 (default: all)"
     )
     several.add_argument("--turntable", metavar="N", type=_positive, help="go once round the cloud in N frames, counted from 1")
-    several.add_argument("--skip-existing", "--resume", action="store_true", help="leave out frames whose image is there and finished")
+    several.add_argument("--resume", "--skip-existing", action="store_true", help="leave out frames whose image is there and finished")
     scene = parser.add_argument_group("a scene")
     scene.add_argument("-D", dest="defines", metavar="KEY=VALUE", action="append", default=[], help="value for a parameter of the scene")
     scene.add_argument("--sensor", type=int, help="number of the camera, from 0 (default 0)")
@@ -187,6 +205,8 @@ def run(argv: Sequence[str], prog: str) -> int:
         "command": shlex.join([*prog.split(), *argv]),
         "version": version("deepclouds"),
         "error": arguments.error,
+        "time": arguments.time,
+        "correct": corrects(arguments, made),
         "seed": arguments.seed,
         "defines": defines,
         "options": options,

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from deepclouds_runtime.renderer import Renderer, RenderResult
     from deepclouds_runtime.turntable import Turntable
 
+# Noise of a pixel that a frame among others aims at, over the mean: with the noise of an image alone, moving clouds would flicker.
+ERROR_OF_FRAMES = 0.014
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -79,6 +82,13 @@ def plan(arguments: Namespace) -> Plan:
     return Plan(frames, sequence, turn)
 
 
+def corrects(arguments: Namespace, made: Plan) -> bool:
+    """Whether images are corrected: unless told, an image alone in the fast mode, as the correction's noise differs between frames."""
+    if arguments.correct is not None:
+        return bool(arguments.correct)
+    return arguments.mode == "fast" and not arguments.audit and made.sequence is None and made.turntable is None
+
+
 def run(made: Plan, arguments: Namespace, load: Mapping[str, Any], record: Mapping[str, Any], say: Callable[[str], None]) -> int:
     """Render the frames of a plan.
 
@@ -115,7 +125,7 @@ def run(made: Plan, arguments: Namespace, load: Mapping[str, Any], record: Mappi
         for index, frame in enumerate(frames):
             if made.sequence is not None and not interruption():
                 job.load(frame)
-            if index and interruption():
+            if interruption() and (index > 0 or made.sequence is not None):
                 break
             job.render(frame, interruption, f" ({index + 1} of {len(frames)})" if len(frames) > 1 else "")
             if interruption():
@@ -193,7 +203,11 @@ class _Job:
 
         started = time.perf_counter() if self._described else self._started
         pictures = None if arguments.progressive is None else Pictures(write, arguments.progressive)
-        dial = {} if arguments.error is None else {"error": arguments.error}
+        dial: dict[str, Any] = {"audit": arguments.audit, "correct": corrects(arguments, self._made), "time_limit": arguments.time}
+        if arguments.error is not None:
+            dial["error"] = arguments.error
+        elif frame.number is not None:
+            dial["error"] = ERROR_OF_FRAMES
         words = "rendering" if frame.number is None else f"frame {frame.number}{place}"
         with _progress(arguments.quiet, words) as (progress, estimate):
             result = renderer.render(

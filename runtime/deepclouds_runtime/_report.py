@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
         rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
     if statistics.network:
         rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
+    rows += list(_audit_rows(statistics.audit))
     for name, source in statistics.sources.items():
         took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
         rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
@@ -41,6 +42,25 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name.ljust(width)}  {value}")
+
+
+def _audit_rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """What the audit found, in lines."""
+    if not found:
+        return
+    yield "error of the network, measured", _measured(found["network"])
+    if found["corrected"]:
+        yield "error once corrected, measured", _measured(found["remaining"])
+    yield "walks that measured it", f"{found['walks']:,}" + ("" if found["corrected"] else ", no correction made")
+
+
+def _measured(error: dict[str, Any]) -> str:
+    low, high = (100 * v for v in error["error_interval"])
+    darker, brighter = (100 * v for v in error["energy_interval"])
+    return (
+        f"{100 * error['error']:.2g} % ({low:.2g} to {high:.2g} %) of regions of multiple scattering, "
+        f"energy {100 * error['energy']:+.2g} % ({darker:+.2g} to {brighter:+.2g} %)"
+    )
 
 
 def settings(renderer: Renderer) -> dict[str, Any]:

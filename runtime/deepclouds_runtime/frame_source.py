@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import drjit as dr
@@ -55,6 +55,8 @@ class FrameSource:
         directions that light comes from.
     doubt
         two more fields, where the network knows its errors: the sum of `octree`'s, and the error to expect of it.
+    built
+        the octree on the host.
     """
 
     octree: DeviceOctree
@@ -64,6 +66,21 @@ class FrameSource:
     queries: int
     lights: int
     doubt: DeviceOctree | None = None
+    built: Octree | None = None
+
+    def corrected(self, correction: Callable[[Array], Array], floor: float) -> FrameSource:
+        """J + (J + floor) d in the place of J, with d = correction(world points), at the nodes; nowhere below 0."""
+        built = self.built
+        if built is None:
+            return self
+        # `floor` is of the mean of the channels: here it is shared among the fields, in equal parts.
+        mixed = float(self.mix.sum(axis=1).mean())
+        of_field = floor / mixed if mixed > 0 else 0.0
+
+        def change(points: Array, values: Array) -> Array:
+            return np.maximum(values + (values + of_field) * correction(points)[:, None], 0)
+
+        return replace(self, octree=built.changed(self.octree.types, change))
 
     def summary(self) -> dict[str, Any]:
         """What it took, for a report."""
@@ -217,7 +234,7 @@ def frame_source(
     device = octree.upload(field.types)
     factor, error = _audit(device, predicted, held_out, every)
     doubt = octree.upload(field.types, carried=True) if predicted.carried else None
-    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights), doubt)
+    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights), doubt, octree)
 
 
 class _Predicted:
@@ -265,9 +282,9 @@ class _Predicted:
 
     def _add(self, points: Array, pairs: Sequence[tuple[int, Arriving]], total: Array, error: Array) -> None:
         types, field, n = self._cloud.field.types, self._cloud.field, len(points)
-        x = _upload(types, np.tile(points, (len(pairs), 1)))
-        d = _upload(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
-        omega = _upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
+        x = upload(types, np.tile(points, (len(pairs), 1)))
+        d = upload(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
+        omega = upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
         tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), _DEEP)
         dr.eval(tau)
         query = x, d, omega, self._cloud.phase, self._albedos, tau
@@ -275,7 +292,7 @@ class _Predicted:
         self.queries += j.size
         j = j.reshape(len(pairs), n, -1)
         errors = np.zeros_like(j) if errors is None else errors.reshape(j.shape)
-        x = _upload(types, points)
+        x = upload(types, points)
         for (e, light), values, expected in zip(pairs, j, errors, strict=True):
             arriving = light.at(x)
             dr.eval(arriving)
@@ -287,7 +304,8 @@ class _Predicted:
                     error += irradiance * expected[:, k]
 
 
-def _upload(types: Any, values: Array) -> Any:
+def upload(types: Any, values: Array) -> Any:
+    """Points (n, 3) on the device, as Array3f."""
     return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c], np.float32)) for c in range(3)))
 
 
@@ -319,7 +337,7 @@ def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: See
     if not len(checks.points):
         return 1.0, 0.0
     true = evaluate(checks.points)[:, : octree.fields].astype(np.float64)[:, ::every]
-    values = octree.lookup(octree.to_local(_upload(octree.types, checks.points)), octree.types.Bool(True))
+    values = octree.lookup(octree.to_local(upload(octree.types, checks.points)), octree.types.Bool(True))
     dr.eval(values)
     interpolated = np.stack([np.array(v, np.float64) for v in values[::every]], axis=1)
     if not (true.sum() > 0 and interpolated.sum() > 0):

@@ -155,6 +155,9 @@ class Octree:
         self.fields = values.shape[2] - carried
         leaves = [self._roots(coordinates, values)]
         leaves[0][cells] = values
+        # Where each leaf lies, in root cells: its corner and its edge.
+        z, y, x = np.unravel_index(np.arange(nx * ny * nz), (nz, ny, nx))
+        corners, edges = [np.stack([x, y, z], axis=1).astype(np.float32)], [np.ones(nx * ny * nz, np.float32)]
         # An entry of the table is the number of a leaf, or less than 0: where the eight entries of the children begin.
         table, slots, count = np.arange(nx * ny * nz), cells, nx * ny * nz
         scale = self._scale(local, member, weights, values, coordinates, 0)
@@ -190,11 +193,15 @@ class Octree:
             slots = len(table) + np.arange(8 * blocks)
             table = np.concatenate([table, count + np.arange(8 * blocks)])
             leaves.append(values)
+            edge = 0.5 ** (level + 1)
+            corners.append((coordinates * edge).astype(np.float32))
+            edges.append(np.full(8 * blocks, edge, np.float32))
             count += 8 * blocks
         self.statistics.nodes = len(self._keys)
         self.statistics.error = float(np.sqrt(settled / max(total, 1e-30)) / max(scale, 1e-30))
         self._table = table.astype(np.int32)
         self._leaves = np.concatenate(leaves).astype(np.float32)
+        self._corners, self._edges = np.concatenate(corners), np.concatenate(edges)
 
     def _scale(self, local: Array, member: Array, weights: Array, values: Array, coordinates: Array, level: int) -> float:
         """Mean value over the points, of the largest field."""
@@ -254,6 +261,13 @@ class Octree:
         """The same on the device, for lookups in kernels: the fields that were asked for, or those that were `carried` along."""
         leaves = self._leaves[..., self.fields :] if carried else self._leaves[..., : self.fields]
         return DeviceOctree(types, self.lattice, self._table, leaves)
+
+    def changed(self, types: Any, change: Callable[[Array, Array], Array]) -> DeviceOctree:
+        """The same on the device with other values: `change` maps world points (n, 3) and values (n, fields) there to values."""
+        local = (self._corners[:, None] + self._edges[:, None, None] * _CORNERS).reshape(-1, 3)
+        leaves = self._leaves[..., : self.fields]
+        values = change(self.lattice.world(local), leaves.reshape(-1, self.fields))
+        return DeviceOctree(types, self.lattice, self._table, values.astype(np.float32).reshape(leaves.shape))
 
 
 class DeviceOctree:

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -18,6 +19,7 @@ from deepclouds.medium.field import Field
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
 from deepclouds_runtime.all_round import AllRound, spread
+from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import confidence, doubtful, relative_errors, warning
 from deepclouds_runtime.fast import fast_cloud_light
@@ -89,6 +91,9 @@ class Statistics:
     network
         where the network knows its errors: ``error`` to expect of the cloud's light, and ``doubtful``, the share of that light in pixels of
         low confidence.
+    audit
+        where walks audited the network: ``walks``; ``network``, its error over regions of the image, root of the mean square over the mean,
+        and its energy, each with an interval of 95 %; whether it was ``corrected``, on how many ``levels``, and what is ``remaining``.
     """
 
     mode: str
@@ -99,6 +104,7 @@ class Statistics:
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     network: dict[str, float] = field(default_factory=dict)
+    audit: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -247,6 +253,10 @@ class Renderer:
         partial: Callable[[RenderResult], None] | None = None,
         interrupted: Callable[[], bool] | None = None,
         estimate: Callable[[float], None] | None = None,
+        *,
+        audit: bool = False,
+        correct: bool = False,
+        time_limit: float | None = None,
     ) -> RenderResult:
         """Render an image.
 
@@ -269,15 +279,27 @@ class Renderer:
             its statistics are not ``complete``.
         estimate
             is called with the estimated noise after each round.
+        audit
+            of the fast mode: measure the network's error in this image with walks, until it is known to be below `error`.
+        correct
+            audit, and correct the network's multiple scattering by what the walks say, where they say that it helps. The light that the
+            cloud throws on surfaces is not corrected.
+        time_limit
+            seconds: the audit ends after half of them, sampling with the round in which they are over. The result then depends on the
+            machine. By default the audit ends after four walks a pixel, at least 262,144.
 
         Raises
         ------
         InputError
-            when `spp` is below 1 or above 1,048,576, or `error` is not positive.
+            when `spp` is below 1 or above 1,048,576, `error` or `time_limit` is not positive, or the reference mode is to be audited.
         """
         scene, types = self.scene, self._types
         if not error > 0:
             raise InputError(f"error = {error}: give the noise to aim at as a share of the mean, for example {ERROR}")
+        if time_limit is not None and not time_limit > 0:
+            raise InputError(f"time = {time_limit:g}: give the seconds that the render may take, for example 10")
+        if (audit or correct) and self.mode != "fast":
+            raise InputError(f"mode = '{self.mode}': only the fast mode is audited and corrected; choose mode 'fast'")
         fast = self.mode == "fast" and (self._network is not None or scene.max_depth == 2)
         most = self.samples(spp) if spp is not None or not fast else _MOST_AUTOMATIC
         started = time.perf_counter()
@@ -305,6 +327,9 @@ class Renderer:
             work.spent("probe", clock)
         if fast:
             work.prepare(_INTERPOLATION * error)
+            if audit or correct:
+                half_time = math.inf if time_limit is None else started + 0.5 * time_limit
+                work.audit(correct, error, half_time, interrupted)
         noise = math.inf
         stopped = False
         if (spp is not None or not fast) and partial is None and interrupted is None:
@@ -323,11 +348,13 @@ class Renderer:
                 if estimate is not None:
                     estimate(noise)
         else:
-            asked = int(scene.sensor.sampler().sample_count())
-            _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
+            _say_ignored(error, int(scene.sensor.sampler().sample_count()))
             growth = 2.0
             work.round(0, 1, most, None)
+            end = math.inf if time_limit is None else started + time_limit
             while work.samples < most and not noise <= error and not (stopped := interrupted is not None and interrupted()):
+                if work.samples > 1 and time.perf_counter() > end:
+                    break
                 before, done = work.beauty(), work.samples
                 if partial is not None:
                     partial(self._result(work, started, noise, False))
@@ -357,6 +384,7 @@ class Renderer:
             if source is not None:
                 statistics.sources[name] = source.summary()
         statistics.skipped = work.skipped()
+        statistics.audit = work.found
         notes = self.notes
         if "confidence" in channels:
             statistics.network = doubtful(channels["confidence"], channels)
@@ -392,6 +420,7 @@ class _Work:
     named: dict[str, FrameSource] = field(default_factory=dict)
     all_round: AllRound | None = None
     errors: Image | None = None
+    found: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         width, height = self.scene.size
@@ -466,9 +495,7 @@ class _Work:
         """Predict multiple scattering for this camera; from then on camera rays ask no network. `quick`: at an eighth of the nodes."""
         clock = time.perf_counter()
         pixel, numbers = self._pilot(_PILOT // 4 if quick else _PILOT)
-        origin, direction, end = self.camera.rays(pixel, numbers)
-        if self.scene.surfaces is not None:
-            _, end, _ = self._surfaces(origin, direction, end)
+        origin, direction, end = self._camera_rays(pixel, numbers)
         seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
         self.spent("pilot", clock)
         clock = time.perf_counter()
@@ -490,6 +517,29 @@ class _Work:
         self.errors = relative_errors(self.sources, seen, np.array(pixel), self.scene.size)
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
+
+    def audit(self, correct: bool, error: float, until: float, interrupted: Callable[[], bool] | None) -> None:
+        """Audit the sources, and correct them, with walks; no further round begins after the time `until`."""
+        if not self.sources:
+            return
+        clock = time.perf_counter()
+        width, height = self.scene.size
+        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, (width, height), self.seed)
+        most = int(np.clip(WALKS_A_PIXEL * width * height, FEWEST, MOST)) if math.isinf(until) else MOST
+
+        def more() -> bool:
+            return time.perf_counter() < until and not (interrupted is not None and interrupted())
+
+        outcome = audited(found, self.sources, correct, error, most, more)
+        self.sources, self.found = outcome.sources, outcome.found
+        self.spent("audit", clock)
+
+    def _camera_rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any]:
+        """Camera rays and where surfaces end them."""
+        origin, direction, end = self.camera.rays(pixel, numbers)
+        if self.scene.surfaces is not None:
+            _, end, _ = self._surfaces(origin, direction, end)
+        return origin, direction, end
 
     def round(
         self,
@@ -665,6 +715,12 @@ class _Work:
         if self.errors is not None:
             channels["confidence"] = confidence(self.errors, channels)
         return channels
+
+
+@cache
+def _say_ignored(error: float, asked: int) -> None:
+    """Once for all frames of a sequence."""
+    _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
 
 
 def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene) -> list[str]:
