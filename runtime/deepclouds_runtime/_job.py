@@ -112,7 +112,7 @@ def run(made: Plan, arguments: Namespace, load: Mapping[str, Any], record: Mappi
     from deepclouds_runtime.progressive import INTERRUPTED, Interruption, to_stderr
 
     frames = made.frames
-    if arguments.resume:
+    if arguments.skip_existing:
         frames = tuple(frame for frame in frames if not _finished(frame, say))
         if not frames:
             say("every frame is there already")
