@@ -1,0 +1,172 @@
+"""Rationale: walks must tell how wrong a network is, and correct it: much where it is wrong, and not at all where it is right.
+
+Expected behaviour: with stand-ins for the network that are wrong by known factors, the audit finds the error within its interval, the
+correction brings the image nearer to one by walks, images stay positive, and one seed makes one image.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from deepclouds_runtime.correction import Correction, Walks
+from deepclouds_runtime.loading import load
+from deepclouds_runtime.output import save
+from deepclouds_runtime.render import main
+from deepclouds_runtime.renderer import RenderResult
+from deepclouds_runtime.scattering import NetworkScattering, WalkScattering
+from numpy.typing import NDArray
+
+from deepclouds.errors import InputError
+from deepclouds.exr import read_attributes
+from deepclouds.volume import Volume, write_vol
+
+Array = NDArray[Any]
+SIZE = 24
+
+
+class Unused:
+    """Stands in for a network; asked by nobody."""
+
+    def predict(self, stencil: Array, aux: Array) -> Array:
+        """Return j (n,)."""
+        return np.ones(len(stencil), np.float32)
+
+
+def factor_of(kind: str, x: Array) -> Array:
+    """By what a stand-in multiplies the truth at world points (n, 3)."""
+    if kind == "constant":
+        return np.full(len(x), 1.3)
+    if kind == "smooth":
+        return 1 + 0.4 * x[:, 1]
+    if kind == "sharp":
+        return np.where(x[:, 1] > 0, 1.4, 0.7)
+    return np.ones(len(x))
+
+
+@pytest.fixture
+def scene(tmp_path: Path, llvm_mitsuba: ModuleType) -> Path:
+    c = (np.arange(16) + 0.5) / 8 - 1
+    z, y, x = np.meshgrid(c, c, c, indexing="ij")
+    ball = np.clip(4 * (0.9 - np.sqrt(x * x + y * y + z * z)), 0, 1).astype(np.float32)
+    write_vol(tmp_path / "ball.vol", Volume.from_box(ball, (-1, -1, -1), (1, 1, 1)))
+    path = tmp_path / "scene.xml"
+    path.write_text(f"""<scene version="3.0.0">
+      <sensor type="perspective"><float name="fov" value="34"/>
+        <transform name="to_world"><lookat origin="1.2, 1, 3.6" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="{SIZE}"/><integer name="height" value="{SIZE}"/><rfilter type="box"/></film>
+      </sensor>
+      <emitter type="directional"><vector name="direction" value="-0.5, -1, -0.8"/><rgb name="irradiance" value="3 3 3"/></emitter>
+      <shape type="cube"><bsdf type="null"/><medium type="heterogeneous" name="interior">
+        <float name="scale" value="6"/><rgb name="albedo" value="1 1 1"/><phase type="hg"><float name="g" value="0.5"/></phase>
+        <volume type="gridvolume" name="sigma_t"><string name="filename" value="ball.vol"/>
+          <transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/><scale value="2"/></transform></volume>
+      </medium></shape></scene>""")
+    return path
+
+
+def rendered(scene: Path, monkeypatch: pytest.MonkeyPatch, kind: str, seed: int = 0, **how: Any) -> RenderResult:
+    """An image in which the network knows the truth, from many walks, times a factor."""
+    renderer = load(scene, predictor=Unused())
+    truth = WalkScattering(renderer._field, 256, 99)
+
+    def asked(self: NetworkScattering, points: Any, w: Any, omega: Any, phase: Any, albedos: Any, tau: Any, errors: Any) -> Any:
+        j = truth(points, w, omega, phase, albedos, tau)
+        return (j * factor_of(kind, np.array(points).T)[:, None]).astype(np.float32), None
+
+    monkeypatch.setattr(NetworkScattering, "_asked", asked)
+    return renderer.render(16, seed, error=0.04, **how)
+
+
+def _error(found: RenderResult, true: RenderResult) -> float:
+    difference = (found.rgb - true.rgb).astype(np.float64).reshape(8, 3, 8, 3, 3).mean(axis=(1, 3))
+    return float(np.sqrt(np.mean(difference**2)) / true.rgb.mean())
+
+
+@pytest.mark.parametrize("kind", ["constant", "smooth", "sharp"])
+def test_a_wrong_network_is_found_out_and_corrected(scene: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    true = rendered(scene, monkeypatch, "exact")
+    wrong = rendered(scene, monkeypatch, kind, audit=True)
+    right = rendered(scene, monkeypatch, kind, correct=True)
+    assert not wrong.statistics.audit["corrected"]
+    assert right.statistics.audit["corrected"]
+    assert _error(right, true) < (0.25 if kind == "constant" else 0.5) * _error(wrong, true)
+    low, high = wrong.statistics.audit["network"]["error_interval"]
+    assert 0.02 < low < high
+    assert right.statistics.audit["remaining"]["error"] < 0.5 * wrong.statistics.audit["network"]["error"]
+    if kind == "constant":
+        low, high = wrong.statistics.audit["network"]["energy_interval"]
+        assert low - 0.02 < 0.3 < high + 0.02
+    assert right.rgb.min() >= 0
+    assert np.isfinite(right.rgb).all()
+
+
+def test_a_network_that_is_right_stays_as_it_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    true = rendered(scene, monkeypatch, "exact")
+    for seed in (0, 1):
+        found = rendered(scene, monkeypatch, "exact", seed, correct=True)
+        alone = rendered(scene, monkeypatch, "exact", seed)
+        assert _error(found, alone) < 0.02
+        assert abs(found.statistics.audit["network"]["energy"]) < 0.02
+    assert true.statistics.audit == {}
+
+
+def test_a_seed_makes_one_image(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, other = (rendered(scene, monkeypatch, "smooth", seed, correct=True) for seed in (5, 5, 6))
+    np.testing.assert_allclose(first.rgb, second.rgb, rtol=1e-4, atol=1e-6)
+    assert first.statistics.audit["walks"] == second.statistics.audit["walks"]
+    assert np.abs(first.rgb - other.rgb).max() > 1e-4
+
+
+def test_the_report_and_the_header_say_what_was_found(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from deepclouds_runtime._report import report
+
+    result = rendered(scene, monkeypatch, "constant", correct=True)
+    save(result, tmp_path / "image.exr")
+    assert '"remaining"' in str(read_attributes(tmp_path / "image.exr")["deepclouds"])
+    report(result, print)
+    text = capsys.readouterr().out
+    assert "error of the network, measured" in text
+    assert "error once corrected, measured" in text
+
+
+@pytest.mark.parametrize(
+    "flags", [["--time", "0"], ["--time", "-3"], ["--mode", "reference", "--audit"], ["--mode", "reference", "--correct"]]
+)
+def test_bad_values_are_refused(scene: Path, tmp_path: Path, flags: list[str]) -> None:
+    with pytest.raises(InputError, match=r"time|mode"):
+        main([str(scene), "-o", str(tmp_path / "image.exr"), "--quiet", *flags])
+
+
+def _smooth(points: Array, bias: float) -> Array:
+    result: Array = 0.5 * bias * (1 + np.sin(6 * points[:, 0]) * np.cos(5 * points[:, 1]))
+    return result
+
+
+def _noisy(n: int, seed: int, bias: float) -> Walks:
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3))
+    walked = rng.exponential(1 + _smooth(points, bias))
+    return Walks(points, np.ones(n), np.ones(n), walked, np.arange(n) % 2)
+
+
+def test_noise_alone_is_shrunken_to_nearly_nothing() -> None:
+    """Kept as it is, the noise of the finest lattice would be about 1 for walks that deviate by 1."""
+    size = [np.sqrt(np.mean(Correction(w)(w.points) ** 2)) for w in (_noisy(20_000, s, 0.0) for s in range(20))]
+    assert np.mean(size) < 0.02
+    assert np.mean([s == 0 for s in size]) > 0.3
+
+
+def test_more_walks_leave_less() -> None:
+    left = []
+    for n in (3_000, 300_000):
+        correction = Correction(_noisy(n, 3, 0.5))
+        x = np.random.default_rng(9).random((5000, 3))
+        left.append(float(np.sqrt(np.mean((correction(x) - _smooth(x, 0.5)) ** 2))))
+    assert left[0] < 0.25
+    assert left[1] < 0.5 * left[0]
