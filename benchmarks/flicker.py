@@ -15,11 +15,14 @@ is, on the screen or on the cloud, does not flicker. `whole image` is the same o
 from __future__ import annotations
 
 import argparse
+import math
+import operator
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,17 +79,16 @@ def change(frames: Sequence[Image]) -> Image:
 
 def flicker(frames: Sequence[Sequence[Image]], a: Sequence[Sequence[Image]], b: Sequence[Sequence[Image]]) -> Flicker:
     """Flicker of triples of images (h, w, 3) against those of two converged renders; see the module."""
-    pixel, whole, real, level = [], [], [], []
+    pixel, whole, real = [], [], []
     for image, one, other in zip(frames, a, b, strict=True):
-        both = one[1] + other[1]
-        lit = both > _DARK * np.quantile(both, 0.999)
+        both: Image = one[1] + other[1]
+        lit = both > _DARK * float(np.quantile(both, 0.999))
         mean = 0.5 * float(both[lit].mean())
         over, under = (change(image) - change(one))[lit], (change(image) - change(other))[lit]
         pixel.append(float(np.mean(over * under)) / mean**2)
         whole.append(float(over.mean() * under.mean()) / mean**2)
         real.append(float(np.mean(change(one)[lit] * change(other)[lit])) / mean**2)
-        level.append(mean)
-    return Flicker(*(float(np.sqrt(max(np.mean(v), 0.0) / 1.5)) for v in (pixel, whole, real)))
+    return Flicker(*(math.sqrt(max(sum(v) / len(v), 0.0) / 1.5) for v in (pixel, whole, real)))
 
 
 def _triples(render: Callable[[int], Image], step: float) -> list[list[Image]]:
@@ -115,7 +117,7 @@ def measure(case: Case, size: int, step: float, error: float, folder: Path) -> d
         return _triples(render, step)
 
     reference = turning("reference")
-    a, b = (frames(reference, _CONVERGED_SPP, lambda frame, first=first: first + frame) for first in _SEEDS.values())
+    a, b = (frames(reference, _CONVERGED_SPP, partial(operator.add, first)) for first in _SEEDS.values())
     fast = turning("fast")
     return {
         "same random numbers": flicker(frames(fast, None, lambda frame: 1), a, b),

@@ -143,7 +143,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--frames", metavar="LIST", type=_frames, help="of a sequence or a turn, as in 1-48, 1-48x2 or 1,5,9-12 (default: all)"
     )
     several.add_argument("--turntable", metavar="N", type=_positive, help="go once round the cloud in N frames, counted from 1")
-    several.add_argument("--resume", "--skip-existing", action="store_true", help="leave out frames whose image is there and finished")
+    several.add_argument(
+        "--resume", "--skip-existing", dest="skip_existing", action="store_true", help="leave out frames whose image is there and finished"
+    )
     scene = parser.add_argument_group("a scene")
     scene.add_argument("-D", dest="defines", metavar="KEY=VALUE", action="append", default=[], help="value for a parameter of the scene")
     scene.add_argument("--sensor", type=int, help="number of the camera, from 0 (default 0)")

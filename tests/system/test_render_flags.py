@@ -52,9 +52,26 @@ KEEPING = {
     "--png": ["{folder}/other.png"],
     "--exposure": ["1"],
     "--multiple": ["walks"],
+    "--progressive": ["0"],
+    "--unit": ["0.01"],
+    "--skip-existing": [],
 }
 # Not for a volume, or a choice of the network, which has tests of its own.
-ELSEWHERE = {"--output", "--sensor", "--model", "--help", "-D", "--mode", "--error", "--extrapolate"}
+ELSEWHERE = {
+    "--output",
+    "--sensor",
+    "--model",
+    "--help",
+    "-D",
+    "--mode",
+    "--error",
+    "--extrapolate",
+    "--frames",
+    "--turntable",
+    "--audit",
+    "--no-correct",
+    "--time",
+}
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,8 @@ from deepclouds_runtime.progressive import Interruption, Pictures
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_asks_and_the_second_ends(number: int) -> None:
-    before, said = signal.getsignal(number), []
+    before = signal.getsignal(number)
+    said: list[str] = []
     with pytest.raises(KeyboardInterrupt), Interruption(said.append) as interruption:  # noqa: PT012
         assert not interruption()
         os.kill(os.getpid(), number)
