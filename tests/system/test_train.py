@@ -20,33 +20,10 @@ from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.run_folder import RunFolder
 from deepclouds_training.shards import open_dataset
 from deepclouds_training.train import main
-from deepclouds_training.train_config import TrainConfig, checked
 from deepclouds_training.trainer import Trainer
 
 from deepclouds.errors import InputError
-
-
-def settings(data: Path, **changes: object) -> TrainConfig:
-    values = {
-        "data": str(data),
-        "steps": 4,
-        "batch": 16,
-        "warmup": 2,
-        "valid_queries": 16,
-        "valid_every": 3,
-        "network": {"width": 8},
-        # Three batches a pool: the resumed run begins in the middle of one.
-        "samples": {"shards": 3, "queries": 16},
-    }
-    return checked({**values, **changes}, "test")
-
-
-def trainer(folder: Path, config: TrainConfig) -> Trainer:
-    dataset = open_dataset(config.data)
-    run = RunFolder(folder)
-    if not (folder / "config.json").exists():
-        run.begin(config, dataset)
-    return Trainer(config, run, dataset, run.shards(dataset))
+from tests.system.small_run import settings, trainer
 
 
 def after(steps: int, one: Trainer) -> Callable[[], bool]:
@@ -63,13 +40,20 @@ def same(a: object, b: object) -> bool:
     return a == b
 
 
+@pytest.mark.parametrize(
+    "parts",
+    [
+        pytest.param({}, id="plain"),
+        pytest.param({"companion": {"width": 8}, "patience": 5, "tensorboard": True, "precision": "bfloat16"}, id="companion"),
+    ],
+)
 @pytest.mark.parametrize("passes", [1, 2])
-def test_two_steps_and_two_more_equal_four(small_dataset: Path, tmp_path: Path, passes: int) -> None:
+def test_two_steps_and_two_more_equal_four(small_dataset: Path, tmp_path: Path, passes: int, parts: dict[str, object]) -> None:
     """Rationale: a run that was killed must be worth as much as one that was not.
 
-    Expected behaviour: weights, averages, optimiser, ranges and logged validation agree bit for bit.
+    Expected behaviour: weights, averages, optimisers, patience, ranges and logged validation agree bit for bit.
     """
-    config = settings(small_dataset, samples={"shards": 3, "queries": 16, "passes": passes})
+    config = settings(small_dataset, samples={"shards": 3, "queries": 16, "passes": passes}, **parts)
     whole = trainer(tmp_path / "whole", config)
     assert whole.train(lambda: False)
     first = trainer(tmp_path / "halves", config)
@@ -83,7 +67,10 @@ def test_two_steps_and_two_more_equal_four(small_dataset: Path, tmp_path: Path, 
         assert state is not None
         assert state.pop("elapsed") > 0
     assert same(states[0], states[1])
-    valid = [[e["figures"] for e in RunFolder(tmp_path / n).metrics() if e["kind"] == "valid"] for n in ("whole", "halves")]
+    assert ("companion" in (states[0] or {})) == ("companion" in parts)
+    valid = [
+        [(e["figures"], e.get("companion")) for e in RunFolder(tmp_path / n).metrics() if e["kind"] == "valid"] for n in ("whole", "halves")
+    ]
     assert valid[0] == valid[1]
     assert len(valid[0]) == 2
 
@@ -187,6 +174,62 @@ def test_schedule_follows_steps_or_minutes(small_dataset: Path, tmp_path: Path) 
     assert one.progress() == pytest.approx(0.5)
 
 
+def test_a_run_ends_when_patience_does(small_dataset: Path, tmp_path: Path) -> None:
+    """A network that cannot move has its best validation at the first; two more without a better one end the run, also when resumed."""
+    still = settings(small_dataset, steps=50, valid_every=1, patience=2, learning_rate=1e-30, final_learning_rate=0, ema=0)
+    one = trainer(tmp_path / "run", still)
+    assert one.train(lambda: False)
+    assert one.step == 3
+    assert one.progress() < 1.0
+    again = trainer(tmp_path / "run", still)
+    assert again.train(lambda: False)
+    assert again.step == 3
+    without = trainer(
+        tmp_path / "without", settings(small_dataset, steps=5, valid_every=1, learning_rate=1e-30, final_learning_rate=0, ema=0)
+    )
+    assert without.train(lambda: False)
+    assert without.step == 5
+
+
+def test_both_rates_are_reported(small_dataset: Path, tmp_path: Path) -> None:
+    """Two pools of 48 samples, each gone through twice in three batches: stencils are built once a pool, samples stepped twice."""
+    one = trainer(tmp_path / "run", settings(small_dataset, steps=12, samples={"shards": 3, "queries": 16, "passes": 2}))
+    built: list[int] = []
+    stepped: list[int] = []
+    lap = one.pace.lap
+
+    def spy(phase: str, stencils: int = 0, samples: int = 0) -> float:
+        built.append(stencils)
+        stepped.append(samples)
+        return lap(phase, stencils, samples)
+
+    one.pace.lap = spy  # type: ignore[method-assign]
+    assert one.train(lambda: False)
+    assert (sum(built), sum(stepped)) == (96, 192)
+    entry = next(e for e in RunFolder(tmp_path / "run").metrics() if e["kind"] == "train")
+    assert 0 < entry["building_share"] < 1
+    assert entry["stencils_built_per_second"] > 0
+    assert entry["samples_stepped_per_second"] > entry["samples_per_second"] > 0
+
+
+def test_events_hold_the_metrics(small_dataset: Path, tmp_path: Path) -> None:
+    """Every figure of metrics.jsonl is found again in TensorBoard's files, those of a resumed run as well."""
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # type: ignore[import-untyped]
+
+    config = settings(small_dataset, tensorboard=True, valid_every=1)
+    first = trainer(tmp_path / "run", config)
+    assert not first.train(after(2, first))
+    assert trainer(tmp_path / "run", config).train(lambda: False)
+    run = RunFolder(tmp_path / "run")
+    read = EventAccumulator(str(run.events)).Reload()
+    expected = {e["step"]: e["figures"]["all"]["energy"] for e in run.metrics() if e["kind"] == "valid"}
+    assert list(expected) == [1, 2, 3, 4]
+    found = {e.step: e.value for e in read.Scalars("valid/figures/all/energy")}
+    assert found == pytest.approx(expected, rel=1e-6)
+    assert {"train/loss", "train/learning_rate", "train/samples_per_second"} <= set(read.Tags()["scalars"])
+
+
 def test_average_is_the_mean_without_a_start_at_zero() -> None:
     network = Network(NetworkConfig(width=8))
     average = WeightAverage(network, 0.9)
@@ -209,6 +252,11 @@ def test_average_is_the_mean_without_a_start_at_zero() -> None:
         ("steps = 0", "steps"),
         ("steps = ", "TOML"),
         ("batch = 100000000", "batch"),
+        ("frozen = true", "frozen trains a companion alone"),
+        ("companion_mix = 2", "companion_mix"),
+        ("[companion]\nwidht = 8", r"companion\.widht"),
+        ("patience = 0", "patience"),
+        ('device = "tpu"', "device"),
     ],
 )
 def test_bad_configuration_is_refused(tmp_path: Path, text: str, message: str) -> None:

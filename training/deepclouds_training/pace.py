@@ -11,9 +11,13 @@ class Pace:
     """Seconds by phase and counts of work, since the start of the process and since the last report."""
 
     def __init__(self) -> None:
-        self._last = time.monotonic()
+        self.start()
         self._began = {"stencils": 0.0, "samples": 0.0, **dict.fromkeys(PHASES, 0.0)}
         self._total = dict(self._began)
+
+    def start(self) -> None:
+        """Begin a lap: what came before is nobody's time."""
+        self._last = time.monotonic()
 
     def lap(self, phase: str, stencils: int = 0, samples: int = 0) -> float:
         """Book the seconds since the last lap, which are returned, and the work done in them, under `phase`."""

@@ -165,7 +165,7 @@ class Trainer:
 
         A checkpoint is written either way.
         """
-        self.pace = Pace()
+        self.pace.start()
         if self.events is not None:
             self.events.open(self.step)
         last_saved = last_report = time.monotonic()
