@@ -42,27 +42,25 @@ def averaged(bricks: Bricks, weights: Sequence[NDArray[np.float32]], first: NDAr
     offset = origin - base * EDGE
     grid = [-(-(len(m) + int(o)) // EDGE) for m, o in zip(matrices, offset, strict=True)]
     mark = np.zeros(grid, bool)
-    begin = [(low[a][bricks.places[:, a]] + offset[a]) // EDGE for a in range(3)]
-    end = [(high[a][bricks.places[:, a]] + offset[a] - 1) // EDGE for a in range(3)]
-    spans = [int((e - b).max(initial=-1)) + 1 for b, e in zip(begin, end, strict=True)]
+    first_of = [(low[a][bricks.places[:, a]] + offset[a]) // EDGE for a in range(3)]
+    last_of = [(high[a][bricks.places[:, a]] + offset[a] - 1) // EDGE for a in range(3)]
+    spans = [int((e - b).max(initial=-1)) + 1 for b, e in zip(first_of, last_of, strict=True)]
     for step in np.ndindex(*spans):
-        place = [b + s for b, s in zip(begin, step, strict=True)]
-        within = np.all([p <= e for p, e in zip(place, end, strict=True)], axis=0)
+        place = [b + s for b, s in zip(first_of, step, strict=True)]
+        within = np.all([p <= e for p, e in zip(place, last_of, strict=True)], axis=0)
         mark[tuple(p[within] for p in place)] = True
     places = np.argwhere(mark)
     numbers = np.full(grid, -1, np.int32)
     numbers[tuple(places.T)] = np.arange(len(places), dtype=np.int32)
     values = np.zeros((len(places), EDGE, EDGE, EDGE), np.float32)
     for corner, block in _blocks(bricks):
-        at = []
+        at, parts = [], []
         for axis, matrix in enumerate(matrices):
-            samples = slice(corner[axis], corner[axis] + block.shape[0])
-            cells = _rows(matrix[:, samples])
-            at.append(cells.start + int(offset[axis]))
-            # Axis 0 always holds the one to do next, and moves to the end when done.
-            part = matrix[cells, samples]
-            block = np.tensordot(block[: part.shape[1]], part, axes=(0, 1))
-        _add(values, numbers, block, at)
+            brick = corner[axis] // EDGE
+            begin, end = int(low[axis][brick]), int(high[axis][brick : brick + _BLOCK][-1])
+            at.append(begin + int(offset[axis]))
+            parts.append(matrix[begin:end, corner[axis] : corner[axis] + block.shape[axis]])
+        _add(values, numbers, _contracted(block, *parts), at)
     shape = tuple(EDGE * n for n in grid)
     return Bricks((shape[0], shape[1], shape[2]), places.astype(np.int32), values), (base * EDGE)[::-1].astype(np.int64)
 
@@ -101,16 +99,22 @@ def _blocks(bricks: Bricks) -> Iterator[tuple[list[int], NDArray[np.float32]]]:
         yield [int(n) * edge for n in of_block[chosen[0]]], block
 
 
+def _contracted(block: NDArray[np.float32], z: NDArray[np.float32], y: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cells of a block by their weights along each axis.
+
+    Products of stacks of small matrices: of large ones the linear algebra library would make work for all threads, which cost ten times
+    what they do.
+    """
+    inside = block[: z.shape[1], : y.shape[1], : x.shape[1]]
+    planes = y @ (inside @ x.T)
+    cells: NDArray[np.float32] = (z @ planes.transpose(1, 0, 2)).transpose(1, 0, 2)
+    return cells
+
+
 def _reach(matrix: NDArray[np.float32], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First row that each group of `width` columns reaches, and one past the last."""
-    parts = [_rows(matrix[:, start : start + width]) for start in range(0, matrix.shape[1], width)]
-    return np.array([p.start for p in parts]), np.array([p.stop for p in parts])
-
-
-def _rows(part: NDArray[np.float32]) -> slice:
-    """The rows of a banded matrix that hold anything."""
-    found = np.flatnonzero(part.any(axis=1))
-    return slice(int(found[0]), int(found[-1]) + 1)
+    parts = [np.flatnonzero(matrix[:, start : start + width].any(axis=1)) for start in range(0, matrix.shape[1], width)]
+    return np.array([p[0] for p in parts]), np.array([p[-1] + 1 for p in parts])
 
 
 def _add(values: NDArray[np.float32], numbers: NDArray[np.int32], block: NDArray[np.float32], at: list[int]) -> None:

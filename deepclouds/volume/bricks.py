@@ -130,8 +130,8 @@ class Bricks:
         # Of every brick the maxima of its first sample, of all, and of the last sample along each axis.
         table = self.values
         for axis in (1, 2, 3):
-            parts = [np.take(table, 0, axis), table.max(axis=axis), np.take(table, EDGE - 1, axis)]
-            table = np.moveaxis(np.stack(parts), 0, axis)
+            ahead = (slice(None),) * axis
+            table = np.stack([table[(*ahead, 0)], table.max(axis=axis), table[(*ahead, EDGE - 1)]], axis=axis)
         bz, by, bx = self.grid
         result = np.zeros((bz, by, bx), np.float32)
         for dz, dy, dx in np.ndindex(3, 3, 3):
