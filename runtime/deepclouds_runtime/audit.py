@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.medium.multiple_scattering import trace_walks
+from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds_runtime import stratified
 from deepclouds_runtime.correction import FLOOR, Correction, Walks
 from deepclouds_runtime.frame_source import FrameSource, seen_by, upload
@@ -173,7 +174,11 @@ class Audit:
         phase = np.broadcast_to(np.array(cloud.phase, np.float32), (n, 3))
         many = np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos)))
         start32, along32 = points.astype(np.float32), along.astype(np.float32)
-        j = trace_walks(cloud.field, start32, along32, phase, np.stack(toward, axis=1), many, 1, key)[:, 0]
+        if len(toward) == 1:
+            j = trace_one_sun(cloud.field, start32, along32, phase, toward[0], many, 1, key)
+        else:
+            j = trace_walks(cloud.field, start32, along32, phase, np.stack(toward, axis=1), many, 1, key)[:, 0]
+        j = j.reshape(n, len(toward), len(albedos))
         for k, irradiance in enumerate(arriving):
             for c, a in enumerate(cloud.albedo):
                 if a > 0:
