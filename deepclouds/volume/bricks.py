@@ -130,8 +130,8 @@ class Bricks:
         # Of every brick the maxima of its first sample, of all, and of the last sample along each axis.
         table = self.values
         for axis in (1, 2, 3):
-            ahead = (slice(None),) * axis
-            table = np.stack([table[(*ahead, 0)], table.max(axis=axis), table[(*ahead, EDGE - 1)]], axis=axis)
+            along = np.moveaxis(table, axis, 0)
+            table = np.stack([along[0], table.max(axis=axis), along[-1]], axis=axis)
         bz, by, bx = self.grid
         result = np.zeros((bz, by, bx), np.float32)
         for dz, dy, dx in np.ndindex(3, 3, 3):
