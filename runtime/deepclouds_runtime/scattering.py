@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepclouds.descriptor import LEVELS, POINTS, Descriptor
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import trace_walks
+from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds.medium.phase import ordered_lobes
 from deepclouds.model import aux_inputs
 
@@ -142,17 +142,17 @@ class WalkScattering:
         x, d, suns = (np.array(v).T.astype(np.float32) for v in (points, w, omega_sun))
         n = len(x)
         seed = int(self._streams.spawn(1)[0].generate_state(1, np.uint64)[0])
-        values = trace_walks(
+        values = trace_one_sun(
             self._field,
             x,
             d,
             np.broadcast_to(np.array(phase, np.float32), (n, 3)),
-            np.broadcast_to(suns, (n, 3))[:, None, :],
+            np.broadcast_to(suns, (n, 3)),
             np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos))),
             self._walks,
             seed,
         )
-        mean: NDArray[np.float32] = values.mean(axis=1)[:, 0, :]
+        mean: NDArray[np.float32] = values.mean(axis=1)
         return mean
 
 
