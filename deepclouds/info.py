@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deepclouds.errors import InputError
+from deepclouds.memory import field_bytes, gib
 from deepclouds.volume import Volume, read_vol
+from deepclouds.volume.bricks import EDGE
+from deepclouds.volume.sparse import MAX_VOXELS
+
+if TYPE_CHECKING:
+    from deepclouds.volume.vdb import GridInfo
 
 
 @dataclass(frozen=True)
@@ -75,17 +83,38 @@ def _vdb(path: Path) -> list[Section]:
             ("class", grid.grid_class),
             ("transform", grid.transform_type or "unknown"),
             ("voxel size", _numbers(grid.voxel_size)),
-            ("active voxels", str(grid.active_voxels)),
         ]
         if grid.index_box is not None:
             lower, upper = grid.index_box
             facts.append(("index box", f"({_numbers(lower)}) to ({_numbers(upper)})"))
-            facts.append(("resolution", " x ".join(str(b - a + 1) for a, b in zip(lower, upper, strict=True))))
+            facts.extend(_sizes(grid, [b - a + 1 for a, b in zip(lower, upper, strict=True)]))
+        else:
+            facts.append(("active voxels", "0"))
         if grid.index_to_world is not None:
             facts.extend((f"index to world {i}", _numbers(row)) for i, row in enumerate(grid.index_to_world))
         facts.extend((f"metadata {key}", str(value)) for key, value in sorted(grid.metadata.items()))
         sections.append(Section(f"grid {grid.unique_name}", facts))
     return sections or [Section(path.name, [("grids", "none")])]
+
+
+def _sizes(grid: GridInfo, resolution: list[int]) -> list[tuple[str, str]]:
+    """Voxels of the box, how many are active, and the memory that a render's extinction takes."""
+    from deepclouds.volume.vdb import kept_in_bricks
+
+    voxels = math.prod(resolution)
+    facts = [
+        ("resolution", " x ".join(map(str, resolution))),
+        ("voxels", str(voxels)),
+        ("active voxels", str(grid.active_voxels)),
+        ("active share", f"{100 * grid.active_voxels / voxels:.3g} %"),
+    ]
+    if grid.value_type != "float":
+        return facts
+    if grid.bricks is not None and kept_in_bricks(voxels, grid.bricks):
+        return [*facts, ("memory", f"about {gib(field_bytes(voxels, grid.bricks))} in {grid.bricks} bricks of {EDGE}^3 voxels")]
+    if voxels <= MAX_VOXELS:
+        return [*facts, ("memory", f"about {gib(field_bytes(voxels))} as a dense grid")]
+    return [*facts, ("memory", f"too large: more than {MAX_VOXELS} voxels, in bricks too")]
 
 
 def _vol(path: Path) -> list[Section]:
@@ -103,6 +132,10 @@ def _density(volume: Volume) -> list[tuple[str, str]]:
     lower, upper = volume.bounds
     facts = [
         ("resolution", " x ".join(map(str, volume.resolution))),
+        ("voxels", str(density.size)),
+        ("filled voxels", str(np.count_nonzero(density))),
+        ("filled share", f"{100 * np.count_nonzero(density) / density.size:.3g} %"),
+        ("memory", f"about {gib(field_bytes(density.size))} as a dense grid"),
         ("box", f"({_numbers(lower)}) to ({_numbers(upper)})"),
         ("voxel size", _numbers(volume.voxel_size)),
         ("density min", f"{density.min():.6g}"),

@@ -22,7 +22,7 @@ from deepclouds.replacing import replacing
 from deepclouds.volume import _openvdb
 from deepclouds.volume._clean import clean
 from deepclouds.volume._volume import Volume
-from deepclouds.volume.bricks import Bricks
+from deepclouds.volume.bricks import BRICK_VOXELS, Bricks
 from deepclouds.volume.sparse import MAX_VOXELS, SparseVolume
 
 DENSE_VOXELS = 2**26
@@ -211,6 +211,11 @@ def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = F
     assert places is not None
     assert values is not None
     return SparseVolume(Bricks((nz, ny, nx), places, clean(values, source, clamp)), to_world)
+
+
+def kept_in_bricks(voxels: int, bricks: int, dense_voxels: int = DENSE_VOXELS) -> bool:
+    """Whether `read_vdb` keeps a box of `voxels` voxels, of which `bricks` bricks hold something, in bricks."""
+    return voxels > dense_voxels and (2 * bricks * BRICK_VOXELS <= voxels or voxels > MAX_VOXELS)
 
 
 def write_vdb(

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from deepclouds.memory import gib
+
 if TYPE_CHECKING:
     from deepclouds_runtime.renderer import Renderer, RenderResult
 
@@ -38,6 +40,7 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
         rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
     rows += [(name.replace("_", " "), f"{value:,}") for name, value in asdict(result.counts).items() if name != "skipped"]
     rows += [(f"no query: {name}", f"{value:,}") for name, value in statistics.skipped.items()]
+    rows += [(f"memory: {name}", gib(count)) for name, count in statistics.memory.items()]
     rows += [(f"time: {name}", f"{seconds:.2f} s") for name, seconds in result.seconds.items()]
     width = max(len(name) for name, _ in rows)
     for name, value in rows:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
+from deepclouds.memory import peak_bytes
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
 from deepclouds_runtime.all_round import AllRound, spread
@@ -94,6 +95,9 @@ class Statistics:
     audit
         where walks audited the network: ``walks``; ``network``, its error over regions of the image, root of the mean square over the mean,
         and its energy, each with an interval of 95 %; whether it was ``corrected``, on how many ``levels``, and what is ``remaining``.
+    memory
+        bytes: ``field``, of density, extinction and majorants; ``levels``, of the field filtered for the network; ``peak``, what the whole
+        process had at most so far.
     """
 
     mode: str
@@ -105,6 +109,7 @@ class Statistics:
     skipped: dict[str, int] = field(default_factory=dict)
     network: dict[str, float] = field(default_factory=dict)
     audit: dict[str, Any] = field(default_factory=dict)
+    memory: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass
@@ -385,6 +390,8 @@ class Renderer:
                 statistics.sources[name] = source.summary()
         statistics.skipped = work.skipped()
         statistics.audit = work.found
+        levels = 0 if self._network is None else self._network.descriptor.nbytes
+        statistics.memory = {"field": self._field.nbytes, "levels": levels, "peak": peak_bytes()}
         notes = self.notes
         if "confidence" in channels:
             statistics.network = doubtful(channels["confidence"], channels)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from deepclouds.cli import main
-from deepclouds.volume import Volume, write_vdb, write_vol
+from deepclouds.volume import Bricks, SparseVolume, Volume, write_vdb, write_vol
 
 
 def facts(text: str) -> dict[str, str]:
@@ -47,7 +47,24 @@ def test_vdb_states_half_and_metadata(capsys: pytest.CaptureFixture[str], tmp_pa
     found = facts(capsys.readouterr().out)
     assert found["values"] == "float, stored with 16 bits"
     assert found["resolution"] == "2 x 1 x 2"
+    assert (found["voxels"], found["active voxels"], found["active share"]) == ("4", "4", "100 %")
+    assert found["memory"].endswith("as a dense grid")
     assert found["metadata author"] == "someone"
+
+
+def test_vdb_states_the_memory_of_a_large_box_by_what_it_holds(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A box of 2e9 voxels with two of them active: two bricks, and a table for the 4 million of the box."""
+    values = np.zeros((2, 8, 8, 8), np.float32)
+    values[:, 3, 4, 5] = 1
+    volume = SparseVolume(Bricks((1264,) * 3, np.array([[0, 0, 0], [157, 157, 157]], np.int32), values), np.eye(4))
+    write_vdb(tmp_path / "a.vdb", volume)
+    assert main(["info", str(tmp_path / "a.vdb")]) == 0
+    found = facts(capsys.readouterr().out)
+    assert (found["voxels"], found["active voxels"]) == (str(1257**3), "2")
+    number, unit = found["memory"].split()[1:3]
+    assert unit == "GiB"
+    assert float(number) == pytest.approx(32 * 158**3 / 2**30, rel=0.1)
+    assert found["memory"].endswith("in 2 bricks of 8^3 voxels")
 
 
 def test_vol_statistics(capsys: pytest.CaptureFixture[str], tmp_path: Path, volume: Volume) -> None:
@@ -55,6 +72,7 @@ def test_vol_statistics(capsys: pytest.CaptureFixture[str], tmp_path: Path, volu
     assert main(["info", str(tmp_path / "a.vol")]) == 0
     found = facts(capsys.readouterr().out)
     assert found["resolution"] == "2 x 3 x 4"
+    assert (found["voxels"], found["filled voxels"], found["filled share"]) == ("24", "4", "16.7 %")
     assert found["box"] == "(0 0 0) to (1 1.5 2)"
     assert float(found["density max"]) == 3
     assert float(found["density mean"]) == pytest.approx(8 / 24, rel=1e-5)

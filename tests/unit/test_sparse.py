@@ -14,6 +14,7 @@ from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
 from deepclouds.medium.optical_depth import optical_depth
+from deepclouds.memory import field_bytes
 from deepclouds.volume import Bricks, SparseVolume, Volume, pyramid
 from deepclouds.volume import sparse as sparse_module
 from deepclouds.volume.pyramid import filtered_levels, mean_extinction, volume_frame
@@ -186,3 +187,13 @@ def test_bricks_are_checked_as_grids_are(bad: float) -> None:
     values[0, 1, 2, 3] = bad
     with pytest.raises(InputError, match="holds 1"):
         SparseVolume(Bricks(bricks.shape, bricks.places, values), np.eye(4))
+
+
+def test_the_memory_that_is_told_is_what_a_field_takes() -> None:
+    volume = lumps((150, 133, 147))
+    dense, sparse = Field(types, volume), Field(types, in_bricks(volume))
+    assert dense.nbytes == pytest.approx(field_bytes(volume.density.size), rel=0.05)
+    kept = len(in_bricks(volume).bricks.places)
+    # With so few bricks their surface counts for more than in a large cloud.
+    assert 0.7 < sparse.nbytes / field_bytes(volume.density.size, kept) < 1.5
+    assert sparse.nbytes < 0.1 * dense.nbytes
