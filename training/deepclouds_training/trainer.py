@@ -226,7 +226,9 @@ class Trainer:
                 # All of the first pool, so that the number of processes makes no difference.
                 whole = pool if self.processes.count == 1 else self.source.whole_pool(number)
                 for network in self._unfitted:
-                    network.fit_inputs(whole.stencil, whole.label)
+                    # Samples lie in main memory, and so does all of the network while it looks at them.
+                    network.cpu().fit_inputs(whole.stencil, whole.label)
+                    network.to(self.device)
             for network in self._unfitted:
                 self.processes.share(network.state_dict().values())
             self._unfitted.clear()
