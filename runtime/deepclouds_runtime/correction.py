@@ -3,8 +3,8 @@
 The correction is a field d over space: J becomes J + (J + b) d, where b is a small share of the mean of J, so that places which the network
 takes for black can be lifted too. d is a sum of piecewise trilinear fields on lattices from coarse to fine. Each lattice takes what the
 coarser ones left, shrunken by how much of it is noise: two independent halves of the walks agree on what is real, and the mean of their
-product is its variance (Wiener's filter). A level at which they do not agree ends the sum. With more walks everything is taken in, down to
-the finest lattice.
+product is its variance (Wiener's filter). A level at which they do not agree is left out: the error of a network may have no coarse part
+but a finer one. With more walks everything is taken in, down to the finest lattice.
 """
 
 from __future__ import annotations
@@ -116,9 +116,7 @@ class Correction:
             chance = float(np.sqrt(np.sum(np.square(2 * weight * noise))) / weight.sum())
             real = float((weight * first * second).sum() / weight.sum()) - _CHANCE * chance
             if not real > 0:
-                if level < 0:
-                    continue
-                break
+                continue
             values = mean_value * real / (real + noise + 1e-300)
             self._parts.append((size, values))
             known = known + (tent * values[index]).sum(axis=1)
