@@ -99,7 +99,7 @@ def test_lookups_are_those_of_the_dense_grid(shape: tuple[int, int, int]) -> Non
 
 def test_bricks_on_each_backend(any_backend: Any) -> None:
     volume = lumps((40, 33, 47))
-    points = np.ascontiguousarray(points_in(volume, 5000, 12).T, np.float32)
+    points = np.ascontiguousarray(points_in(volume, 20_000, 12).T, np.float32)
     dense, sparse = (np.array(Field(any_backend, v, 2.7).sigma_t(any_backend.Array3f(points))) for v in (volume, in_bricks(volume)))
     assert np.count_nonzero(dense) > 100
     np.testing.assert_array_equal(sparse, dense)
