@@ -118,6 +118,8 @@ def trilinear(grid: Grid, low: list[Any], frac: list[Any], active: Any = True) -
 
 def _widened(types: ModuleType, bricks: Bricks, places: NDArray[np.int64], scale: float) -> Any:
     """Samples of the bricks at `places`, each with one more along every axis, after a brick of zeros."""
+    if not len(bricks.places):
+        return dr.zeros(types.Float, _WIDE_VOXELS)
     # One brick of nothing around the upper ends, so that every brick has neighbours.
     numbers = np.full(tuple(n + 1 for n in bricks.grid), -1, np.int32)
     numbers[tuple(bricks.places.T)] = np.arange(len(bricks.places), dtype=np.int32)

@@ -205,3 +205,15 @@ def test_the_memory_that_is_told_is_what_a_field_takes() -> None:
     # With so few bricks their surface counts for more than in a large cloud.
     assert 0.7 < sparse.nbytes / field_bytes(volume.density.size, kept) < 1.5
     assert sparse.nbytes < 0.1 * dense.nbytes
+
+
+def test_bricks_that_hold_nothing() -> None:
+    empty = SparseVolume(Bricks((20, 30, 40), np.zeros((0, 3), np.int32), np.zeros((0, 8, 8, 8), np.float32)), np.eye(4))
+    field = Field(types, empty, 3.0)
+    assert field.majorant == 0
+    points = np.random.default_rng(13).uniform(-0.2, 1.2, (100, 3))
+    assert not np.array(field.sigma_t(upload(points))).any()
+    assert mean_extinction(empty) == 0
+    assert len(empty.row_ends(0.0)[0]) == 0
+    w = np.broadcast_to([0.0, 0.6, 0.8], points.shape)
+    assert not Descriptor(field).stencils_numpy(points, w, w[:, ::-1]).any()
