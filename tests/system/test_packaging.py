@@ -17,7 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-COMMANDS = {"info", "compare", "clouds", "generate", "dataset", "train", "export", "evaluate", "render", "verify"}
+COMMANDS = {"info", "compare", "clouds", "generate", "dataset", "train", "export", "evaluate", "calibrate", "render", "verify", "card"}
 
 
 @pytest.fixture(scope="module")
