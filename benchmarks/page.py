@@ -19,12 +19,14 @@ def write_results(page: Path, module: str, body: str) -> None:
     Raises
     ------
     InputError
-        when the page is missing or its marks are not there once each.
+        when the page is missing or its first mark is not there once, or no last one follows.
     """
     first, last = marks(module)
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
-    if not all(text.count(mark) == 1 for mark in (first, last)):
+    head, found, rest = text.partition(first)
+    # A page may hold the results of several benchmarks, each with an end of its own.
+    _, end, tail = rest.partition(last)
+    if not (found and end) or first in rest:
         raise InputError(f"{page}: needs the lines '{first}' and '{last}' once each, to put the results between")
-    head, tail = text.split(first)[0], text.split(last)[1]
     with replacing(page, ".md") as temporary:
         temporary.write_text(f"{head}{first}\n\n{body}\n\n{last}{tail}", encoding="utf-8")

@@ -104,6 +104,11 @@ def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:
     for _ in range(2):
         write_results(page, "labels", "figures")
         assert page.read_text() == f"before\n{marks('labels')[0]}\n\nfigures\n\n{marks('labels')[1]}\nafter\n"
+    page.write_text("\n".join((*marks("labels"), *marks("bench"))))
+    write_results(page, "bench", "others")
+    write_results(page, "labels", "figures")
+    labels_first, end, bench_first = (*marks("labels"), marks("bench")[0])
+    assert page.read_text() == f"{labels_first}\n\nfigures\n\n{end}\n{bench_first}\n\nothers\n\n{end}"
     page.write_text("no marks")
     with pytest.raises(InputError, match="once each"):
         write_results(page, "labels", "figures")
