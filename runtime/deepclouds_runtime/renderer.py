@@ -276,8 +276,8 @@ class Renderer:
         error
             of the fast mode: noise of a pixel to aim at, root of the mean square over the mean; the interpolation may add half as much.
         partial
-            is called with the image so far, first of all with a quick look (fast mode: one sample a pixel, J at few nodes, surfaces without
-            the cloud's light), then after each round of samples but the last. The look is thrown away: the final image is the same with
+            is called with the image so far, first of all with a quick look (fast mode: one sample a pixel with one collision, J at few nodes,
+            surfaces without the cloud's light), then after each round of samples but the last. The look is thrown away: the final image is the same with
             and without `partial`, but for rounding.
         interrupted
             is asked between passes whether to stop. The image is then made of what there is, of one sample of every pixel at least, and
@@ -317,7 +317,7 @@ class Renderer:
         work.spent("lights", started)
         if fast and partial is not None:
             clock = time.perf_counter()
-            look = _Work(scene, camera, cloud, lights, lights, types, seed, False)
+            look = _Work(scene, camera, cloud, lights, lights, types, seed, False, depths=1)
             look.prepare(math.inf, quick=True)
             look.round(0, 1, most, None)
             partial(self._result(look, started, None, False))
@@ -419,6 +419,7 @@ class _Work:
     types: Any
     seed: int
     interreflection: bool
+    depths: int = _DEPTHS
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
     sums: dict[str, Image] = field(default_factory=dict)
@@ -642,7 +643,7 @@ class _Work:
         if self.sources is None:
             light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
         else:
-            light = fast_cloud_light(self.cloud, self.on_cloud, self.sources, origin, direction, end, numbers, self.counts, _DEPTHS)
+            light = fast_cloud_light(self.cloud, self.on_cloud, self.sources, origin, direction, end, numbers, self.counts, self.depths)
         dr.eval(light.direct, light.indirect)
         dr.sync_thread()
         self.spent("cloud", clock)
