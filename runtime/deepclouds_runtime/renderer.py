@@ -276,9 +276,9 @@ class Renderer:
         error
             of the fast mode: noise of a pixel to aim at, root of the mean square over the mean; the interpolation may add half as much.
         partial
-            is called with the image so far, first of all with a quick look (fast mode: one sample a pixel with one collision, J at few nodes,
-            surfaces without the cloud's light), then after each round of samples but the last. The look is thrown away: the final image is the same with
-            and without `partial`, but for rounding.
+            is called with the image so far, first of all with a quick look (fast mode: one sample a pixel with one collision, J at few
+            nodes, surfaces without the cloud's light), then after each round of samples but the last. The look is thrown away: the final
+            image is the same with and without `partial`, but for rounding.
         interrupted
             is asked between passes whether to stop. The image is then made of what there is, of one sample of every pixel at least, and
             its statistics are not ``complete``.
