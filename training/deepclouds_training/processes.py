@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Iterable
 from typing import Self
@@ -16,7 +17,7 @@ from deepclouds.errors import InputError
 
 
 class Processes:
-    """The processes that torchrun started, or the one there is.
+    """The processes that torchrun started, or the one there is: a context in which they are connected.
 
     Every one of them holds all weights and builds its own part of each pool of samples; a batch is the batch that one process would
     take, each row handled by the process that holds it. Gradients are sums over all rows, so the model is that of one process up to the
@@ -38,6 +39,9 @@ class Processes:
 
     def __enter__(self) -> Self:
         if self.count > 1:
+            # Adam imports this module, whose defaults keep the group that there is by then: its threads would outlive `__exit__`, and
+            # one that still frees a tensor when the interpreter ends aborts the process.
+            importlib.import_module("torch.distributed.nn.functional")
             # What is agreed on lies in main memory, gradients where the weights are.
             dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
         return self
