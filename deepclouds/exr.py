@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,6 +112,23 @@ def read_exr(path: str | os.PathLike[str]) -> Exr:
         when the file is missing, not an EXR file, cut short or corrupted, holds deep data, subsampled channels or parts of different
         sizes. NaN and Inf are read as they stand; what uses the image decides about them.
     """
+    with _opened(path, separate_channels=True) as (name, file):
+        parts = [(dict(part.header), dict(part.channels)) for part in file.parts]
+        if not parts:
+            raise InputError(f"{name}: the pixels cannot be read; the file is cut short or corrupted, write it again")
+        return _collect(name, parts)
+
+
+def read_attributes(path: str | os.PathLike[str]) -> dict[str, str | float | int]:
+    """Free attributes of an EXR file's header, without its pixels; raises InputError like `read_exr`."""
+    with _opened(path, header_only=True) as (_, file):
+        header = dict(file.parts[0].header)
+    return {k: v for k, v in header.items() if k not in _STRUCTURE and isinstance(v, str | int | float) and not isinstance(v, bool)}
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str], **how: bool) -> Iterator[tuple[str, Any]]:
+    """Name and OpenEXR's file object of an image; whatever goes wrong inside is an InputError that names the file."""
     name = os.fspath(path)
     if not os.path.isfile(name):
         raise InputError(f"{name}: no such image file")
@@ -118,31 +137,12 @@ def read_exr(path: str | os.PathLike[str]) -> Exr:
         with warnings.catch_warnings():
             # The binding warns about colour metadata that a file may lack; that says nothing about its pixels.
             warnings.simplefilter("ignore")
-            with openexr.File(name, separate_channels=True) as file:
-                parts = [(dict(part.header), dict(part.channels)) for part in file.parts]
-                if not parts:
-                    raise InputError(f"{name}: the pixels cannot be read; the file is cut short or corrupted, write it again")
-                return _collect(name, parts)
+            with openexr.File(name, **how) as file:
+                yield name, file
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"{name}: not a readable OpenEXR file ({error}); write it again") from error
-
-
-def read_attributes(path: str | os.PathLike[str]) -> dict[str, str | float | int]:
-    """Free attributes of an EXR file's header, without its pixels; raises InputError like `read_exr`."""
-    name = os.fspath(path)
-    if not os.path.isfile(name):
-        raise InputError(f"{name}: no such image file")
-    openexr = _openexr()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with openexr.File(name, header_only=True) as file:
-                header = dict(file.parts[0].header)
-    except Exception as error:
-        raise InputError(f"{name}: not a readable OpenEXR file ({error}); write it again") from error
-    return {k: v for k, v in header.items() if k not in _STRUCTURE and isinstance(v, str | int | float) and not isinstance(v, bool)}
 
 
 def _collect(path: str, parts: list[tuple[dict[str, object], dict[str, object]]]) -> Exr:
