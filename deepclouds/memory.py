@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 from deepclouds.volume.bricks import BRICK_VOXELS, EDGE
 
@@ -16,6 +18,11 @@ def peak_bytes() -> int:
     """Largest resident size that this process has had so far, in bytes."""
     import resource
 
+    # Linux hands `ru_maxrss` on from the parent to a process that it starts; this line of its status begins anew with the program.
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # Kilobytes but for macOS, which counts bytes.
     return largest if sys.platform == "darwin" else 1024 * largest
