@@ -1,4 +1,4 @@
-"""Measures how wrong the predicted multiple scattering of a frame is, with walks from points drawn as the image shows them.
+"""Measures how wrong the predicted multiple scattering of a frame is, and corrects it, with walks from what the image shows.
 
 Walks are noisy and unbiased. In two independent halves of them the noise is independent too: the product of what both find in a region of
 the image is, on the mean, the square of the prediction's error there.
@@ -11,39 +11,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
-from deepclouds.medium.multiple_scattering import trace_walks
-from deepclouds.medium.one_sun import trace_one_sun
-from deepclouds_runtime import stratified
-from deepclouds_runtime.correction import FLOOR, Correction, Walks
-from deepclouds_runtime.frame_source import FrameSource, seen_by, upload
-from deepclouds_runtime.lights import on_host
-from deepclouds_runtime.stratified import Stratified
+from deepclouds_runtime.audit_walks import Batch, Rays, Walks
+from deepclouds_runtime.correction import FLOOR, GROUPS, Correction, Sums
+from deepclouds_runtime.frame_source import FrameSource
+from deepclouds_runtime.octree import Array
 from deepclouds_runtime.transport import Cloud, Lights
 
-Array = NDArray[Any]
 # Regions along the longer side of an image.
 _REGIONS = 24
 # Regions darker than this share of the brightest ones do not count.
 _DARK = 0.02
-# Directions of light from all around that a walk is connected to.
-_BEAMS = 4
-# Collisions of a ray that walks may start from, and the fewest rays that look for them.
-_DEPTHS, _LEAST_RAYS = 4, 1 << 13
-# Walks of the first round; a round has two batches for each half, and every further round as many walks as all before.
+# Points at which a correction is looked at to judge it.
+_LOOKED_AT = 1 << 16
+# Walks of the first round; every further round has as many walks as all before.
 _FIRST = 1 << 16
 # Walks by default: so many a pixel, within these limits.
 WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
 # Standard deviations of an interval of 95 %.
 _INTERVAL = 1.96
+# Channels whose ratio at the points differs by less than this are corrected as one.
+_GREY = 1e-3
 
 
 @dataclass(frozen=True)
 class RegionError:
-    """Error of the predicted multiple scattering, over its mean in the image.
+    """Error of the predicted multiple scattering over regions of the image and colour channels, over its mean.
 
     Attributes
     ----------
@@ -72,218 +66,119 @@ class RegionError:
 
 
 class Audit:
-    """Walks of one frame.
+    """Walks of one frame, gathered as they come: in cells, to correct, and in regions of the image, to judge.
 
     Parameters
     ----------
-    cloud, lights
-        the medium and all that lights it.
-    sources
-        what is audited.
-    rays
-        pixels and random numbers -> origin, direction and end of camera rays.
-    size
-        (width, height) of the image, pixels.
-    seed
-        of all random numbers.
+    cloud, lights, sources, rays, size, seed
+        see `deepclouds_runtime.audit_walks.Walks`; `sources` is what is audited.
     """
 
-    def __init__(
-        self,
-        cloud: Cloud,
-        lights: Lights,
-        sources: Sequence[FrameSource],
-        rays: Callable[[Any, Stratified], tuple[Any, Any, Any]],
-        size: tuple[int, int],
-        seed: int,
-    ) -> None:
-        self._cloud, self._lights, self._sources, self._rays, self._size = cloud, lights, sources, rays, size
-        self._seed = np.random.SeedSequence([seed & 0xFFFFFFFF, 0xA0D17])
-        self._parts: list[tuple[Array, ...]] = []
-        self._batches = 0
+    def __init__(self, cloud: Cloud, lights: Lights, sources: Sequence[FrameSource], rays: Rays, size: tuple[int, int], seed: int) -> None:
+        self._walks = Walks(cloud, lights, sources, rays, size, seed)
+        self._sources, self._size = sources, size
+        self._sums: Sums | None = None
+        self._looked_at: list[tuple[Array, Array, Array, Array]] = []
+        width, height = size
+        self._side = max(1, math.ceil(max(width, height) / _REGIONS))
+        y, x = np.divmod(np.arange(width * height), width)
+        self._area = np.bincount(self._region(y * width + x)) / (width * height)
+        self.count = 0
 
-    @property
-    def count(self) -> int:
-        """Walks so far."""
-        return sum(len(part[0]) for part in self._parts)
+    def _region(self, pixels: Array) -> Array:
+        width = self._size[0]
+        region: Array = pixels // width // self._side * -(-width // self._side) + pixels % width // self._side
+        return region
 
     def extend(self, walks: int) -> None:
-        """Trace `walks` more walks, in two batches for each half."""
-        for _ in range(4):
-            self._add(max(walks // 4, 1))
+        """Trace `walks` more walks, a fourth of them for each group; the first two groups are one half, the others the other."""
+        for group in range(GROUPS):
+            for batch in self._walks.batches(max(walks // GROUPS, 1)):
+                self._add(batch, group)
 
-    def _add(self, walks: int) -> None:
-        types = self._cloud.field.types
-        (own,) = self._seed.spawn(1)
-        random = np.random.default_rng(own)
-        key = int(random.integers(1 << 32))
-        width, height = self._size
-        rays = max(walks // 2, _LEAST_RAYS)
-        chosen = ((np.arange(rays) + random.random(rays)) * (width * height / rays)).astype(np.int64)
-        chosen = np.minimum(chosen, width * height - 1)
-        pixel = types.UInt32(chosen.astype(np.uint32))
-        one = dr.opaque(types.UInt32, 1)
-        numbers = Stratified(types, pixel, dr.arange(types.UInt32, rays), one, dr.opaque(types.UInt32, key)).unrelated()
-        origin, direction, end = self._rays(pixel, numbers)
-        seen = seen_by(self._cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _DEPTHS)
-        batch, self._batches = self._batches, self._batches + 1
-        if not len(seen.points):
-            return
-        along = np.broadcast_to(np.array(direction).T, (rays, 3))[seen.rays]
-        predicted = predicted_at(self._sources, seen.points)
-        share = seen.weights / rays
-        # Walks are noisier where J is larger; some must be left for where the network sees nothing.
-        level = predicted.mean(axis=1)
-        wanted = share * (level + max(FLOOR * float(np.average(level, weights=share)), 1e-30))
-        total = np.cumsum(wanted)
-        place = (np.arange(walks) + random.random()) / walks * total[-1]
-        drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
-        weights = share[drawn] / (wanted[drawn] / total[-1])
-        walked = self._walked(seen.points[drawn], along[drawn], key, random)
-        half = np.full(walks, batch % 2, np.int8)
-        quarter = np.full(walks, batch // 2 % 2, np.int8)
-        self._parts.append((seen.points[drawn], weights, predicted[drawn], walked, half, quarter, chosen[seen.rays[drawn]]))
-
-    def _walked(self, points: Array, along: Array, key: int, random: np.random.Generator) -> Array:
-        """J (n, channels) of one walk a point, under every sun and a few directions of each other light."""
-        cloud, types, n = self._cloud, self._cloud.field.types, len(points)
-        x = upload(types, points)
-        toward, arriving = [], []
-        for sun in self._lights.suns:
-            omega = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in sun.omega_sun))
-            visible = np.broadcast_to(np.array(self._lights.shade.visible(x, omega)), n)
-            toward.append(np.broadcast_to(np.array(sun.omega_sun, np.float32), (n, 3)))
-            arriving.append(visible[:, None] * np.array(sun.irradiance, np.float64))
-        for source, _ in self._lights.sources:
-            start = random.random((2, n))
-            for k in range(_BEAMS):
-                # Roberts' sequence, shifted at random: the directions of one walk lie apart.
-                u, v = ((start[a] + k * step) % 1 for a, step in enumerate((0.7548776662466927, 0.5698402909980532)))
-                omega, density = source.sample(*(types.Float(np.minimum(t, 1 - 1e-7).astype(np.float32)) for t in (u, v)))
-                lanes, one = dr.arange(types.UInt32, n), dr.opaque(types.UInt32, 1)
-                numbers = Stratified(types, lanes, dr.full(types.UInt32, k, n), one, dr.opaque(types.UInt32, key)).unrelated()
-                light = source.arriving(x, omega, numbers)
-                dr.eval(light, omega, density)
-                likely: Array = np.maximum(np.broadcast_to(np.array(density, np.float64), n), 1e-30)
-                toward.append(np.broadcast_to(np.array(omega, np.float32).T, (n, 3)))
-                arriving.append(on_host(light, n) / (_BEAMS * likely[:, None]))
-        albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
-        result = np.zeros((n, len(cloud.albedo)))
-        if not toward or not albedos:
-            return result
-        phase = np.broadcast_to(np.array(cloud.phase, np.float32), (n, 3))
-        many = np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos)))
-        start32, along32 = points.astype(np.float32), along.astype(np.float32)
-        if len(toward) == 1:
-            j = trace_one_sun(cloud.field, start32, along32, phase, toward[0], many, 1, key)
-        else:
-            j = trace_walks(cloud.field, start32, along32, phase, np.stack(toward, axis=1), many, 1, key)[:, 0]
-        j = j.reshape(n, len(toward), len(albedos))
-        for k, irradiance in enumerate(arriving):
-            for c, a in enumerate(cloud.albedo):
-                if a > 0:
-                    result[:, c] += irradiance[:, c] * (a * a / (4 * math.pi)) * j[:, k, albedos.index(a)]
-        return result
+    def _add(self, batch: Batch, group: int) -> None:
+        predicted, walked = batch.predicted, batch.walked
+        if self._sums is None:
+            level = predicted.mean(axis=1, keepdims=True)
+            ratio = predicted / np.maximum(level, 1e-30)
+            # Where all channels are one up to a factor, so is what corrects them.
+            self._grey = bool(np.all(np.ptp(ratio, axis=0) < _GREY * np.maximum(ratio.max(axis=0), 1e-30)))
+            mean = np.average(predicted, weights=batch.weights, axis=0)
+            floor = FLOOR * np.maximum(mean.mean(keepdims=True) if self._grey else mean, 1e-30)
+            self._sums = Sums(batch.points.min(axis=0), batch.points.max(axis=0), floor)
+            shape = 2, len(floor), len(self._area)
+            self._residual, self._truth, self._number = np.zeros(shape), np.zeros(shape), np.zeros(2)
+            self._moments = np.zeros(2)
+        if self._grey:
+            predicted, walked = predicted.mean(axis=1, keepdims=True), walked.mean(axis=1, keepdims=True)
+        self._sums.add(batch.points, batch.weights, predicted, walked, group)
+        region, half, weights = self._region(batch.pixels), group // 2, batch.weights
+        for c in range(len(self._sums.floor)):
+            self._residual[half, c] += np.bincount(region, weights * (predicted[:, c] - walked[:, c]), len(self._area))
+            self._truth[half, c] += np.bincount(region, weights * walked[:, c], len(self._area))
+        self._number[half] += len(weights)
+        together = weights * (predicted - walked).sum(axis=1)
+        self._moments += together.sum(), np.square(together).sum()
+        self.count += len(weights)
+        if len(self._looked_at) < GROUPS:
+            few = slice(0, None, max(1, len(weights) * GROUPS // _LOOKED_AT))
+            self._looked_at.append((batch.points[few], weights[few], predicted[few], region[few]))
 
     def before(self) -> RegionError:
         """Error of what is audited."""
-        return self._judged(self._all()[2])
-
-    def of(self, sources: Sequence[FrameSource]) -> RegionError:
-        """Error of other sources, which these walks have not corrected."""
-        return self._judged(predicted_at(sources, self._all()[0]))
+        return self._judged(None)
 
     def correction(self) -> Correction:
         """The correction that all walks ask for."""
-        return Correction(self._walks(self._all()))
+        assert self._sums is not None
+        return Correction(self._sums)
 
     def remaining(self) -> RegionError:
         """Error that a correction leaves: each half is corrected with what the other half says. That of all walks leaves less."""
-        everything = self._all()
-        points, weights, predicted, _, half, quarter, _ = everything
-        changed = np.empty_like(predicted)
-        for other in (0, 1):
-            own = half == other
-            correction = Correction(self._walks(everything).of(~own, quarter))
-            changed[own] = predicted_at(corrected_sources(self._sources, correction, predicted, weights), points[own])
-        return self._judged(predicted, changed)
+        assert self._sums is not None
+        return self._judged([self._step(Correction(self._sums, halves)) for halves in (((2,), (3,)), ((0,), (1,)))])
+
+    def _step(self, correction: Correction) -> Array:
+        """By how much a correction changes the image's multiple scattering (channels, regions)."""
+        assert self._sums is not None
+        points, weights, predicted, region = (np.concatenate(parts) for parts in zip(*self._looked_at, strict=True))
+        change = np.maximum(predicted + (predicted + self._sums.floor) * correction(points), 0) - predicted
+        return np.stack([np.bincount(region, weights * of_channel, len(self._area)) for of_channel in change.T]) / len(weights)
 
     def corrected(self, correction: Correction) -> list[FrameSource]:
-        """The sources with a correction in them."""
-        _, weights, predicted, *_ = self._all()
-        return corrected_sources(self._sources, correction, predicted, weights)
+        """The sources with a correction in the values at their nodes."""
+        assert self._sums is not None
+        if not correction.levels:
+            return list(self._sources)
+        return [source.corrected(correction, self._sums.floor / len(self._sources)) for source in self._sources]
 
-    def _all(self) -> tuple[Array, ...]:
-        return tuple(np.concatenate(parts) for parts in zip(*self._parts, strict=True))
-
-    @staticmethod
-    def _walks(everything: tuple[Array, ...]) -> Walks:
-        points, weights, predicted, walked, half, _, _ = everything
-        return Walks(points, weights, predicted.mean(axis=1), walked.mean(axis=1), half)
-
-    def _judged(self, predicted: Array, changed: Array | None = None) -> RegionError:
-        """Error of J (n, channels) at the points; or of `changed`, whose change in each half does not depend on that half's walks."""
-        _, weights, _, walked, half, _, pixels = self._all()
-        width, height = self._size
-        side = max(1, math.ceil(max(width, height) / _REGIONS))
-        columns, rows = -(-width // side), -(-height // side)
-        region = pixels // width // side * columns + pixels % width // side
-        y, x = np.divmod(np.arange(width * height), width)
-        area: Array = np.bincount(y // side * columns + x // side, minlength=columns * rows) / (width * height)
-        truth = weights * walked.mean(axis=1)
-        if not truth.mean() > 0:
+    def _judged(self, steps: list[Array] | None) -> RegionError:
+        """Error of what is audited; or with a change (channels, regions) for each half that does not depend on that half's walks."""
+        truth = self._truth.sum(axis=0) / self.count
+        if not truth.sum() > 0:
             return RegionError(0.0, 0.0, 0.0, 0.0)
-        level = np.bincount(region, truth, len(area)) / len(truth) / area
+        level = truth / self._area
         lit = level > _DARK * np.quantile(level, 0.999)
-
-        def of_regions(values: Array, h: int) -> Array:
-            own = half == h
-            sums: Array = np.bincount(region[own], values[own], len(area))[lit].astype(np.float64)
-            sums /= max(np.count_nonzero(own), 1)
-            return sums
-
-        residual = weights * predicted.mean(axis=1) - truth
-        errors = [of_regions(residual, h) for h in (0, 1)]
+        errors = self._residual / np.maximum(self._number, 1)[:, None, None]
         product = errors[0] * errors[1]
-        if changed is not None:
-            change = weights * (changed - predicted).mean(axis=1)
+        residual = float(self._moments[0]) / self.count
+        if steps is not None:
             # Of (e + c)^2 the first part is known as the product of the halves, the others are linear in the noise of one half alone.
-            for h in (0, 1):
-                step = of_regions(change, h)
-                product = product + 0.5 * (2 * errors[h] * step + np.square(step))
-            residual = residual + change
-        product /= area[lit]
+            for error, step in zip(errors, steps, strict=True):
+                product = product + 0.5 * (2 * error * step + np.square(step))
+                residual += 0.5 * float(step.sum())
+        # Channels of a region err together.
+        of_region = np.where(lit, product / self._area, 0).sum(axis=0)
         # Over the mean of the lit part, as the error of an image is.
-        shown = float(area[lit].sum())
-        norm = float((level * area)[lit].sum()) ** 2 / shown
-        mean = float(truth.mean())
+        norm = float(truth[lit].sum()) ** 2 / float((lit * self._area).sum())
+        mean = float(truth.sum())
+        variance = max(float(self._moments[1]) / self.count - (float(self._moments[0]) / self.count) ** 2, 0.0)
         return RegionError(
-            float(residual.mean()) / mean,
-            float(residual.std()) / math.sqrt(len(truth)) / mean,
-            float(product.sum()) / norm,
-            float(np.sqrt(np.square(product).sum())) / norm,
+            residual / mean,
+            math.sqrt(variance / self.count) / mean,
+            float(of_region.sum()) / norm,
+            float(np.sqrt(np.square(of_region).sum())) / norm,
         )
-
-
-def predicted_at(sources: Sequence[FrameSource], points: Array) -> Array:
-    """J (n, channels) of all sources at world points (n, 3)."""
-    types = sources[0].octree.types
-    x = upload(types, points)
-    total: Array | None = None
-    for source in sources:
-        values = source.octree.lookup(source.octree.to_local(x), types.Bool(True))
-        found = on_host(source.colours(values), len(points))
-        total = found if total is None else total + found
-    assert total is not None
-    return total
-
-
-def corrected_sources(sources: Sequence[FrameSource], correction: Correction, predicted: Array, weights: Array) -> list[FrameSource]:
-    """The sources with a correction in the values at their nodes; `predicted` (n, channels) and `weights` are those of the walks."""
-    if not correction.levels:
-        return list(sources)
-    mean = float(np.average(predicted.mean(axis=1), weights=weights))
-    return [source.corrected(correction, FLOOR * mean / len(sources)) for source in sources]
 
 
 @dataclass(frozen=True)

@@ -1,56 +1,83 @@
 """What walks say about the predicted multiple scattering, made into a smooth correction of it.
 
 The correction is a field d over space: J becomes J + (J + b) d, where b is a small share of the mean of J, so that places which the network
-takes for black can be lifted too. d is a sum of piecewise trilinear fields on lattices from coarse to fine. Each lattice takes what the
-coarser ones left, shrunken by how much of it is noise: two independent halves of the walks agree on what is real, and the mean of their
+takes for black can be lifted too. d is a sum of piecewise trilinear fields on nested lattices from coarse to fine. Each lattice takes what
+the coarser ones left, shrunken by how much of it is noise: two independent halves of the walks agree on what is real, and the mean of their
 product is its variance (Wiener's filter). A level at which they do not agree is left out: the error of a network may have no coarse part
 but a finer one. With more walks everything is taken in, down to the finest lattice.
+
+The noise of a node is that of its walks in number, at the variance of the walks in a wide neighbourhood. Its own walks may not tell it: the
+rare ones that find much light would be believed less for it, and the sum would be too dark.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from deepclouds_runtime.octree import Array
+
 # Share of the mean of J that is added to J where the correction is taken in proportion to it.
 FLOOR = 0.02
-# Cells along the longest edge: 1, 2, 4, ...; before them one number for all.
-_LEVELS = 6
-# Walks are gathered in so many cells along the longest edge first.
-_FINE = 64
-# Agreement of the halves, in standard deviations of what chance would give, below which it does not count.
-_CHANCE = 1.0
+# Cells along the longest edge: 1, 2, 4, ... 64; before them one number for all. Walks are gathered in the finest of them.
+_LEVELS = 7
+_FINE = 1 << (_LEVELS - 1)
+# Level whose cells share what is known of the walks' variance.
+_POOLED = 2
+# Agreement of the halves, in standard deviations of what chance would give, that does not count.
+CHANCE = 0.5
+# Independent groups of walks.
+GROUPS = 4
 
 
-@dataclass(frozen=True)
-class Walks:
-    """Walks from points of the cloud, and what was predicted there.
+class Sums:
+    """Walks gathered in cells, group by group.
 
-    Attributes
+    Parameters
     ----------
-    points
-        (n, 3) world points.
-    weights
-        (n,) what a walk counts in the image.
-    predicted, walked
-        (n,) J, mean of the colour channels.
-    half
-        (n,) 0 or 1: which of two independent halves a walk belongs to.
+    lower, upper
+        (3,) corners of the box that they start from, world; what lies outside counts in the nearest cell.
+    floor
+        (channels,) what is added to J where a correction is in proportion to it.
     """
 
-    points: Array
-    weights: Array
-    predicted: Array
-    walked: Array
-    half: Array
+    def __init__(self, lower: Array, upper: Array, floor: Array) -> None:
+        self.lower, self.floor = np.asarray(lower, np.float64), np.asarray(floor, np.float64)
+        self.longest = max(float((upper - lower).max()), 1e-30)
+        self.edges = np.clip((upper - lower) / self.longest, 1e-6, 1)
+        self._size = cells_along(self.edges, _LEVELS - 1)
+        cells, channels = int(np.prod(self._size)), len(self.floor)
+        self.count = np.zeros(cells)
+        self._place = np.zeros((3, cells))
+        # Of residuals J_walk - J, of J + floor, both by group, and of squared residuals.
+        self.residual = np.zeros((GROUPS, channels, cells))
+        self.scale = np.zeros((GROUPS, channels, cells))
+        self.square = np.zeros((channels, cells))
 
-    def of(self, chosen: Array, half: Array) -> Walks:
-        """Some of the walks, in other halves."""
-        return Walks(self.points[chosen], self.weights[chosen], self.predicted[chosen], self.walked[chosen], half[chosen])
+    def local(self, points: Array) -> Array:
+        """World points (n, 3) in longest edges from the box's corner, inside of the box."""
+        return np.clip((points - self.lower) / self.longest, 0, self.edges)
+
+    def add(self, points: Array, weights: Array, predicted: Array, walked: Array, group: int) -> None:
+        """Add walks: world points (n, 3), what each counts in the image (n,), and J (n, channels) as predicted and as walked."""
+        local = self.local(points)
+        cell = np.ravel_multi_index(tuple(np.minimum((local * _FINE).astype(np.int64), self._size - 1).T), tuple(self._size))
+        n = len(self.count)
+        self.count += np.bincount(cell, minlength=n)
+        for axis in range(3):
+            self._place[axis] += np.bincount(cell, local[:, axis], n)
+        for c, floor in enumerate(self.floor):
+            residual = weights * (walked[:, c] - predicted[:, c])
+            self.residual[group, c] += np.bincount(cell, residual, n)
+            self.scale[group, c] += np.bincount(cell, weights * (predicted[:, c] + floor), n)
+            self.square[c] += np.bincount(cell, np.square(residual), n)
+
+    def filled(self) -> tuple[Array, Array]:
+        """Cells that hold walks, and the mean place (m, 3) of the walks in each."""
+        cells = np.flatnonzero(self.count)
+        return cells, (self._place[:, cells] / self.count[cells]).T
 
 
 class Correction:
@@ -58,8 +85,10 @@ class Correction:
 
     Parameters
     ----------
-    walks
-        what it is fitted to.
+    sums
+        the walks.
+    halves
+        the groups of walks that make each of the two independent halves; the others are not looked at.
 
     Attributes
     ----------
@@ -67,91 +96,106 @@ class Correction:
         how many lattices it is made of, the single number counted.
     """
 
-    def __init__(self, walks: Walks) -> None:
-        lower, upper = walks.points.min(axis=0), walks.points.max(axis=0)
-        self._lower, self._edges = lower, np.maximum(upper - lower, 1e-9 * max(float((upper - lower).max()), 1e-30))
-        self._parts: list[tuple[Array | None, Array]] = []
-        longest = float(self._edges.max())
-        place = self._local(walks.points)
-        fine = np.maximum((_FINE * self._edges / longest).astype(np.int64), 1)
-        cell = np.ravel_multi_index(tuple(np.minimum((place * fine).astype(np.int64), fine - 1).T), tuple(fine))
-        cells, member = np.unique(cell, return_inverse=True)
-
-        def gathered(values: Array) -> Array:
-            return np.bincount(member, values, len(cells))
-
-        mean = float(np.average(walks.predicted, weights=walks.weights)) if walks.weights.sum() > 0 else 0.0
-        if not mean > 0:
+    def __init__(self, sums: Sums, halves: tuple[tuple[int, ...], tuple[int, ...]] = ((0, 1), (2, 3))) -> None:
+        self._sums = sums
+        channels = len(sums.floor)
+        self._field, self._level, self.levels = np.zeros((1, 1, 1, channels)), -1, 0
+        cells, place = sums.filled()
+        if not len(cells):
             return
-        scale = walks.weights * (walks.predicted + FLOOR * mean)
-        residual = walks.weights * (walks.walked - walks.predicted)
-        halves = [walks.half == h for h in (0, 1)]
-        of_residual, of_scale = ([gathered(np.where(h, v, 0)) for h in halves] for v in (residual, scale))
-        # Variance of a cell's summed residual, from the walks themselves.
-        variance = gathered(np.square(residual))
-        total = gathered(scale)
-        centre = np.stack([gathered(scale * place[:, a]) / np.maximum(total, 1e-300) for a in range(3)], axis=1)
-        known = np.zeros(len(cells))
+        residual, scale = ([values[list(h)][:, :, cells].sum(axis=0) for h in halves] for values in (sums.residual, sums.scale))
+        variance = self._variance(cells, place) * (len(halves[0]) + len(halves[1])) / GROUPS
+        field, known = self._field, np.zeros((channels, len(cells)))
         for level in range(-1, _LEVELS):
-            size = None if level < 0 else np.maximum(np.ceil(2.0**level * self._edges / longest), 1).astype(np.int64)
-            index, tent, count = _tents(centre, size)
-
-            def at_nodes(values: Array, index: Array = index, tent: Array = tent, count: int = count) -> Array:
-                return np.bincount(index.ravel(), (tent * values[:, None]).ravel(), count)
-
-            left = [at_nodes(r - s * known) for r, s in zip(of_residual, of_scale, strict=True)]
-            below = [at_nodes(s) for s in of_scale]
-            spread = np.bincount(index.ravel(), (tent**2 * variance[:, None]).ravel(), count)
-            both = np.minimum(*below) > 1e-12 * float(total.sum())
-            if not both.any():
-                break
-            first, second = (np.where(both, r / np.where(both, s, 1), 0) for r, s in zip(left, below, strict=True))
-            mean_value = np.where(both, sum(left) / np.where(both, sum(below), 1), 0)
-            # Few walks underestimate their own variance: every node gets part of what is usual.
-            sums = np.where(both, sum(below), 1)
-            usual = float(variance.sum() / total.sum()) / sums
-            noise = np.where(both, np.maximum(spread / np.square(sums), 0.5 * usual), 0)
-            weight = np.where(both, np.sqrt(below[0] * below[1]), 0)
-            # Chance alone makes this product vary by about twice the noise of a mean of both halves.
-            chance = float(np.sqrt(np.sum(np.square(2 * weight * noise))) / weight.sum())
-            real = float((weight * first * second).sum() / weight.sum()) - _CHANCE * chance
-            if not real > 0:
+            size = cells_along(sums.edges, level)
+            field = _refined(field, size, level)
+            index, tent, count = _tents(place, size, level)
+            values = np.zeros((count, channels))
+            for c in range(channels):
+                left = [_at_nodes(r[c] - s[c] * known[c], index, tent, count) for r, s in zip(residual, scale, strict=True)]
+                below = [_at_nodes(s[c], index, tent, count) for s in scale]
+                values[:, c] = _shrunken(left, below, _at_nodes(variance[c], index, np.square(tent), count))
+            if not values.any():
                 continue
-            values = mean_value * real / (real + noise + 1e-300)
-            self._parts.append((size, values))
-            known = known + (tent * values[index]).sum(axis=1)
+            field = field + values.reshape(field.shape)
+            flat = field.reshape(count, channels)
+            known = np.einsum("mk,mkc->cm", tent, flat[index])
+            self._field, self._level = field, level
+            self.levels += 1
 
-    @property
-    def levels(self) -> int:
-        """How many lattices it is made of."""
-        return len(self._parts)
+    def _variance(self, cells: Array, place: Array) -> Array:
+        """Variance (channels, m) of the sum of the residuals of all walks in each cell, from those of a wide neighbourhood."""
+        sums = self._sums
+        index, tent, count = _tents(place, cells_along(sums.edges, _POOLED), _POOLED)
+        walks = sums.count[cells]
+        below = np.maximum(_at_nodes(walks, index, tent, count), 1e-300)
+        pooled = [_at_nodes(square[cells], index, tent, count) / below for square in sums.square]
+        result: Array = np.stack([walks * (tent * of_node[index]).sum(axis=1) for of_node in pooled])
+        return result
 
     def __call__(self, points: Array) -> Array:
-        """The field d (n,) at world points (n, 3); beyond the walks it goes on as at the nearest place that they know."""
-        place = self._local(points)
-        result = np.zeros(len(points))
-        for size, values in self._parts:
-            index, tent, _ = _tents(place, size)
-            result += (tent * values[index]).sum(axis=1)
+        """The field d (n, channels) at world points (n, 3); beyond the walks it goes on as at the nearest place that they know."""
+        index, tent, count = _tents(self._sums.local(points), cells_along(self._sums.edges, self._level), self._level)
+        found: Array = np.einsum("nk,nkc->nc", tent, self._field.reshape(count, -1)[index])
         # J stays positive.
-        held: Array = np.maximum(result, -1)
-        return held
-
-    def _local(self, points: Array) -> Array:
-        place: Array = np.clip((points - self._lower) / self._edges, 0, 1)
-        return place
+        return np.maximum(found, -1)
 
 
-def _tents(place: Array, size: Array | None) -> tuple[Array, Array, int]:
-    """Nodes (n, 8) of a lattice of `size` cells around places (n, 3) in the unit cube, their weights, and how many nodes there are."""
-    if size is None:
-        return np.zeros((len(place), 1), np.int64), np.ones((len(place), 1)), 1
-    scaled = place * size
-    corner = np.minimum(scaled.astype(np.int64), size - 1)
-    fraction = scaled - corner
-    index, weights = np.zeros((len(place), 1), np.int64), np.ones((len(place), 1))
+def _shrunken(left: list[Array], below: list[Array], variance: Array) -> Array:
+    """What two halves leave at the nodes of a lattice, over what is below it, shrunken by the part of it that is noise."""
+    total = below[0] + below[1]
+    both = np.minimum(*below) > 1e-9 * float(total.max(initial=0.0))
+    if not both.any():
+        return np.zeros(len(total))
+    first, second = (np.where(both, r / np.where(both, s, 1), 0) for r, s in zip(left, below, strict=True))
+    weight = np.where(both, np.sqrt(below[0] * below[1]), 0)
+    real = float((weight * first * second).sum() / weight.sum())
+    sure = np.where(both, total, 1)
+    noise = variance / np.square(sure)
+    # The product of two halves varies by chance by about twice the noise of their mean.
+    real -= CHANCE * float(np.sqrt(np.sum(np.square(2 * weight * noise)))) / float(weight.sum())
+    if not real > 0:
+        return np.zeros(len(total))
+    return np.where(both, (left[0] + left[1]) / sure * (real / (real + noise + 1e-300)), 0)
+
+
+def cells_along(edges: Array, level: int) -> NDArray[np.int64]:
+    """Cells of a lattice along each axis of a box whose `edges` are given over the longest; level -1 is a single number."""
+    return np.zeros(3, np.int64) if level < 0 else np.maximum(np.ceil(edges * 2.0**level - 1e-9), 1).astype(np.int64)
+
+
+def _refined(field: Array, size: Array, level: int) -> Array:
+    """Values (x, y, z, channels) at the nodes of a lattice, as those of the lattice twice as coarse interpolate them."""
+    if level < 0:
+        return field
+    if level == 0:
+        return np.broadcast_to(field, (*(size + 1), field.shape[3])).copy()
     for axis in range(3):
-        below = index * (size[axis] + 1) + corner[:, axis : axis + 1]
-        t = fraction[:, axis : axis + 1]
-        index, weights = np.concatenate([below, below + 1], axis=1), np.concatenate([weights * (1 - t), weights * t], axis=1)
+        values = np.moveaxis(field, axis, 0)
+        fine = np.empty((2 * len(values) - 1, *values.shape[1:]))
+        fine[::2] = values
+        fine[1::2] = 0.5 * (values[1:] + values[:-1])
+        field = np.moveaxis(fine[: size[axis] + 1], 0, axis)
+    return field
+
+
+def _at_nodes(values: Array, index: Array, weights: Array, count: int) -> Array:
+    result: Array = np.bincount(index.ravel(), (weights * values[:, None]).ravel(), count)
+    return result
+
+
+def _tents(local: Array, size: Array, level: int) -> tuple[Array, Array, int]:
+    """Nodes (n, 8) of a lattice around places (n, 3) in longest edges, their weights, and how many nodes there are."""
+    if level < 0:
+        return np.zeros((len(local), 1), np.int64), np.ones((len(local), 1)), 1
+    scaled = local * 2.0**level
+    corner = np.minimum(scaled.astype(np.int64), size - 1)
+    fraction = np.minimum(scaled - corner, 1)
+    stride = np.array([(size[1] + 1) * (size[2] + 1), size[2] + 1, 1])
+    base = corner @ stride
+    index, weights = np.empty((len(local), 8), np.int64), np.empty((len(local), 8))
+    for k, steps in enumerate(itertools.product((0, 1), repeat=3)):
+        index[:, k] = base + int(np.dot(steps, stride))
+        x, y, z = (fraction[:, a] if step else 1 - fraction[:, a] for a, step in enumerate(steps))
+        weights[:, k] = x * y * z
     return index, weights, int(np.prod(size + 1))

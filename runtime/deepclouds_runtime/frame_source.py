@@ -68,17 +68,29 @@ class FrameSource:
     doubt: DeviceOctree | None = None
     built: Octree | None = None
 
-    def corrected(self, correction: Callable[[Array], Array], floor: float) -> FrameSource:
-        """J + (J + floor) d in the place of J, with d = correction(world points), at the nodes; nowhere below 0."""
+    def corrected(self, correction: Callable[[Array], Array], floor: Array) -> FrameSource:
+        """J + (J + floor) d in the place of J at the nodes, with d = correction(world points); nowhere below 0.
+
+        Parameters
+        ----------
+        correction
+            d (n, channels), or (n, 1) for all channels.
+        floor
+            the same of each channel, (channels,) or (1,).
+        """
         built = self.built
         if built is None:
             return self
-        # `floor` is of the mean of the channels: here it is shared among the fields, in equal parts.
-        mixed = float(self.mix.sum(axis=1).mean())
-        of_field = floor / mixed if mixed > 0 else 0.0
+        # Each channel is one field times a factor: a field takes the mean of what its channels ask for.
+        channels = len(self.mix)
+        share = self.mix / np.maximum(self.mix.sum(axis=0), 1e-30)
+        of_field = (share / np.maximum(self.mix, 1e-30)).T @ np.broadcast_to(floor, channels)
 
         def change(points: Array, values: Array) -> Array:
-            return np.maximum(values + (values + of_field) * correction(points)[:, None], 0)
+            d = correction(points)
+            asked = np.broadcast_to(d, (len(points), channels)) @ share
+            changed: Array = np.maximum(values + (values + of_field) * asked, 0)
+            return changed
 
         return replace(self, octree=built.changed(self.octree.types, change))
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from deepclouds_runtime.correction import Correction, Walks
+from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
 from deepclouds_runtime.render import main
@@ -149,25 +149,62 @@ def _smooth(points: Array, bias: float) -> Array:
     return result
 
 
-def _noisy(n: int, seed: int, bias: float) -> Walks:
+def _noisy(n: int, seed: int, bias: float) -> Sums:
+    """Walks that deviate as walks do, by more than their mean and to one side, where J is 1 and should be 1 + `_smooth`."""
     rng = np.random.default_rng(seed)
-    points = rng.random((n, 3))
-    walked = rng.exponential(1 + _smooth(points, bias))
-    return Walks(points, np.ones(n), np.ones(n), walked, np.arange(n) % 2)
+    sums = Sums(np.zeros(3), np.array([1.0, 0.6, 0.8]), np.array([0.02, 0.02]))
+    for group in range(GROUPS):
+        points = rng.random((n // GROUPS, 3)) * (1, 0.6, 0.8)
+        true = 1 + _smooth(points, bias)
+        walked = true * np.where(rng.random(len(points)) < 0.2, rng.exponential(5.0, len(points)), 0)
+        # The second channel is right.
+        right = np.where(rng.random(len(points)) < 0.2, rng.exponential(5.0, len(points)), 0)
+        sums.add(points, np.ones(len(points)), np.ones((len(points), 2)), np.stack([walked, right], axis=1), group)
+    return sums
+
+
+def _left(sums: Sums, bias: float) -> tuple[float, float]:
+    """What a correction leaves of the first channel's error, root of the mean square, and what it does to the channel that is right."""
+    x = np.random.default_rng(9).random((5000, 3)) * (1, 0.6, 0.8)
+    found = Correction(sums)(x) * 1.02
+    return float(np.sqrt(np.mean((found[:, 0] - _smooth(x, bias)) ** 2))), float(np.sqrt(np.mean(found[:, 1] ** 2)))
 
 
 def test_noise_alone_is_shrunken_to_nearly_nothing() -> None:
-    """Kept as it is, the noise of the finest lattice would be about 1 for walks that deviate by 1."""
-    size = [np.sqrt(np.mean(Correction(w)(w.points) ** 2)) for w in (_noisy(20_000, s, 0.0) for s in range(20))]
-    assert np.mean(size) < 0.02
-    assert np.mean([s == 0 for s in size]) > 0.3
+    """As it is, the noise of the finest lattice would be above 10, and that of the mean of all walks is 0.01."""
+    harm = [_left(_noisy(100_000, seed, 0.0), 0.0) for seed in range(20)]
+    assert np.mean(harm) < 0.01
+    assert np.max(harm) < 0.04
 
 
 def test_more_walks_leave_less() -> None:
-    left = []
-    for n in (3_000, 300_000):
-        correction = Correction(_noisy(n, 3, 0.5))
-        x = np.random.default_rng(9).random((5000, 3))
-        left.append(float(np.sqrt(np.mean((correction(x) - _smooth(x, 0.5)) ** 2))))
-    assert left[0] < 0.25
+    left, harm = zip(*(_left(_noisy(n, 3, 0.8), 0.8) for n in (4_000, 400_000, 4_000_000)), strict=True)
+    assert left[0] < 0.35
     assert left[1] < 0.5 * left[0]
+    assert left[2] < 0.6 * left[1]
+    assert left[2] < 0.05
+    assert max(harm[1:]) < 0.02
+
+
+def test_rare_large_walks_do_not_darken() -> None:
+    """A node that believed its walks by their own spread would take back what the largest of them bring."""
+    means = []
+    for seed in range(8):
+        x = np.random.default_rng(9).random((5000, 3)) * (1, 0.6, 0.8)
+        means.append(float(Correction(_noisy(400_000, seed, 0.8))(x)[:, 0].mean() * 1.02 - _smooth(x, 0.8).mean()))
+    assert abs(np.mean(means)) < 4 * np.std(means) / np.sqrt(len(means)) + 0.002
+    assert np.std(means) < 0.01
+
+
+def test_halves_that_are_left_out_say_nothing() -> None:
+    sums, other = _noisy(20_000, 3, 0.8), _noisy(20_000, 3, 0.8)
+    other.residual[2:] = 1e6
+    x = np.random.default_rng(9).random((100, 3))
+    halves = ((0,), (1,))
+    np.testing.assert_allclose(Correction(sums, halves)(x), Correction(other, halves)(x))
+
+
+def test_no_walks_correct_nothing() -> None:
+    correction = Correction(Sums(np.zeros(3), np.zeros(3), np.ones(1)))
+    assert correction.levels == 0
+    assert not correction(np.random.default_rng(1).random((10, 3))).any()
