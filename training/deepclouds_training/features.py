@@ -23,16 +23,16 @@ class AngleFeatures(nn.Module):
     gamma resolve a peak that the raw angle cannot.
     """
 
-    degrees_1: Tensor
-    degrees_2: Tensor
+    chosen: Tensor
     binomials: Tensor
     groups: Tensor
 
     def __init__(self) -> None:
         super().__init__()
         terms = [(n, i) for n in ORDERS for i in range(n + 1)]
-        self.register_buffer("degrees_1", torch.tensor([i for _, i in terms]), persistent=False)
-        self.register_buffer("degrees_2", torch.tensor([n - i for n, i in terms]), persistent=False)
+        # Columns of `_powers` of g1, g2 and both weights: g1^i g2^(n - i), and the same of the weights.
+        exponents = [[i for _, i in terms], [n - i for n, i in terms]] * 2
+        self.register_buffer("chosen", torch.tensor([4 * e + k for k, row in enumerate(exponents) for e in row]), persistent=False)
         self.register_buffer("binomials", torch.tensor([float(math.comb(n, i)) for n, i in terms]), persistent=False)
         groups = torch.tensor([[float(n == order) for order in ORDERS] for n, _ in terms])
         self.register_buffer("groups", groups, persistent=False)
@@ -56,10 +56,10 @@ class AngleFeatures(nn.Module):
 
     def phase_of_orders(self, gamma: Tensor, g1: Tensor, g2: Tensor, weight: Tensor) -> Tensor:
         """``4 pi p`` at `gamma` after 1, 2, 4 and 8 scatterings: columns (n, 1) to (n, 4)."""
-        one = torch.ones_like(g1)
-        product = torch.index_select(_powers(g1, one), 1, self.degrees_1) * torch.index_select(_powers(g2, one), 1, self.degrees_2)
-        mixture = torch.index_select(_powers(weight, one), 1, self.degrees_1)
-        mixture = mixture * torch.index_select(_powers(1.0 - weight, one), 1, self.degrees_2) * self.binomials
+        # All powers together, in as few operations as there are: a small network spends much of its time in their number.
+        powers = _powers(torch.cat([g1, g2, weight, 1.0 - weight], dim=1))
+        g1_i, g2_i, weight_i, rest_i = torch.split(torch.index_select(powers, 1, self.chosen), len(self.binomials), dim=1)
+        product, mixture = g1_i * g2_i, weight_i * rest_i * self.binomials
         a = torch.abs(product)
         # (1 - |g|)^2 + 4 |g| sin^2 keeps its digits where 1 + g^2 - 2 g cos cancels, and half angles resolve the peak itself.
         ahead, behind = torch.sin(0.5 * gamma), torch.cos(0.5 * gamma)
@@ -77,15 +77,15 @@ def log_octaves(f: Tensor) -> Tensor:
     scattering alone, and with exact convolutions in the place of their scaled g. The constant stands for light that has lost all
     memory of its direction.
     """
-    columns = torch.split(f, 1, dim=1)
-    tau = torch.exp(4.0 * columns[LOG1P_TAU]) - 1.0
-    terms = [0.5**i * torch.exp(4.0 * columns[LOG_PHASE + i] - 0.5**i * tau) for i in (1, 2, 3)]
-    return torch.log(terms[0] + terms[1] + terms[2] + 0.02)
+    tau = torch.exp(4.0 * f[:, LOG1P_TAU : LOG1P_TAU + 1]) - 1.0
+    share = torch.tensor([[0.5, 0.25, 0.125]], dtype=f.dtype, device=f.device)
+    terms = share * torch.exp(4.0 * f[:, LOG_PHASE + 1 : LOG_PHASE + 4] - share * tau)
+    return torch.log(terms.sum(dim=1, keepdim=True) + 0.02)
 
 
-def _powers(value: Tensor, one: Tensor) -> Tensor:
-    """Columns value^0 to value^8 of (n, 1); products, because a power function of zero or of negative numbers is not portable."""
-    powers = [one]
+def _powers(values: Tensor) -> Tensor:
+    """Powers 0 to 8 of (n, k), (n, 9 k); products, because a power function of zero or of negative numbers is not portable."""
+    powers = [torch.ones_like(values)]
     for _ in range(max(ORDERS)):
-        powers.append(powers[-1] * value)
+        powers.append(powers[-1] * values)
     return torch.cat(powers, dim=1)

@@ -104,9 +104,12 @@ class Block(nn.Module):
         self.out = nn.Linear(width, width)
 
     def standardised(self, mean: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        """Weight and bias that take a raw level as V and b take ``(x - mean) * scale``; cheaper than standardising every row."""
+        """Weight and bias that take raw values as V and b take ``(x - mean) * scale``; cheaper than standardising every row.
+
+        `mean` and `scale` are one number each, or one for every value.
+        """
         weight = self.stencil.weight * scale
-        return weight, self.stencil.bias - mean * weight.sum(dim=1)
+        return weight, self.stencil.bias - (weight * mean).sum(dim=1)
 
     def forward(self, x: Tensor, weight: Tensor, bias: Tensor, f: Tensor, o: Tensor | None) -> Tensor:
         """One level `x` (n, 225) through the `standardised` weights, the features `f`, the output `o` of the block before."""
@@ -190,11 +193,14 @@ class Network(nn.Module):
     def folded(self) -> Network:
         """The same function with the standardisation inside the weights, for export; not for training."""
         result = copy.deepcopy(self)
-        if self.pooling is not None:
-            return result
         for k, block in zip(self.sequence, result.blocks, strict=True):
             assert isinstance(block, Block)
-            weight, bias = block.standardised(self.level_mean[k], self.level_scale[k])
+            # A block of pooled levels reads `together` of them, one after the other.
+            first = self.config.levels.index(k)
+            read = list(self.config.levels[first : first + self.config.together])
+            each = block.stencil.in_features // len(read)
+            mean, scale = (values[read].repeat_interleave(each) for values in (self.level_mean, self.level_scale))
+            weight, bias = block.standardised(mean, scale)
             block.stencil.weight.copy_(weight)
             block.stencil.bias.copy_(bias)
         result.is_folded = True
@@ -206,14 +212,21 @@ class Network(nn.Module):
         With v = c * value, log(1 + v) is log(value + 1 / c) and the fourth root that of value + 0.05 / c, up to constants that the
         standardisation takes up: one pass less over the largest array there is.
         """
-        floor = self._floor(k)
-        value = torch.clamp(level, 0.0, STENCIL_LIMIT)
+        return self._compressed(level, self._floor(k))
+
+    def _compressed(self, values: Tensor, floor: float | Tensor) -> Tensor:
+        values = torch.clamp(values, 0.0, STENCIL_LIMIT)
         if self.config.compression == "log":
-            return torch.log(value + floor)
-        return torch.sqrt(torch.sqrt(value + ROOT_FLOOR * floor))
+            return torch.log(values + floor)
+        return torch.sqrt(torch.sqrt(values + ROOT_FLOOR * floor))
 
     def _floor(self, k: int) -> float:
         return 2.0**-k if self.config.scale == "depth" else 1.0
+
+    def _floors(self, levels: tuple[int, ...]) -> float | Tensor:
+        """The floors of several levels, (levels, 1), or the one number that they share."""
+        floors = [self._floor(k) for k in levels]
+        return floors[0] if len(set(floors)) == 1 else torch.tensor(floors, device=self.level_mean.device).unsqueeze(1)
 
     def forward(self, stencil: Tensor, aux: Tensor) -> Tensor:
         """Predict j (n,) from `stencil` (n, 10, 225) and `aux` (n, 6)."""
@@ -230,17 +243,20 @@ class Network(nn.Module):
         return self.through(lambda k: self.compressed(levels[k], k), f, self.is_folded)
 
     def pooled(self, stencil: Tensor) -> dict[int, Tensor]:
-        """What each block of pooled levels reads, standardised, (n, channels * together), by its first level."""
+        """What each block of pooled levels reads, (n, channels * together), by its first level; standardised, unless that is `folded`."""
         assert self.pooling is not None
         config = self.config
         step = config.levels[1] - config.levels[0] if len(config.levels) > 1 else 1
         even = range(config.levels[0], config.levels[-1] + 1, step)
         # A slice costs less than a gathering of levels, and nothing where it is the whole stencil.
         read = stencil[:, even.start : even.stop : step] if tuple(even) == config.levels else stencil[:, list(config.levels)]
-        means = torch.unbind(self.pooling(read).float(), dim=1)
-        ready = [(self.compressed(x, k) - self.level_mean[k]) * self.level_scale[k] for k, x in zip(config.levels, means, strict=True)]
+        # All levels in one: small networks spend their time in the number of operations.
+        means = self._compressed(self.pooling(read).float(), self._floors(config.levels))
+        if not self.is_folded:
+            chosen = list(config.levels)
+            means = (means - self.level_mean[chosen].unsqueeze(1)) * self.level_scale[chosen].unsqueeze(1)
         n = config.together
-        return {config.levels[i]: torch.cat(ready[i : i + n], dim=1) for i in range(0, len(ready), n)}
+        return {config.levels[i]: means[:, i : i + n].flatten(1) for i in range(0, len(config.levels), n)}
 
     def through(self, level: Callable[[int], Tensor], f: Tensor, plain: bool) -> Tensor:
         """All layers but the last, from what `level` gives for level k, (n, 225) or less, and the features `f`.
