@@ -1,61 +1,57 @@
-"""Run time against error: deepclouds, path tracing, path tracing denoised and single scattering, side by side in one run.
+"""Run time against error: deepclouds, path tracing, path tracing denoised, octaves and single scattering, side by side in one run.
 
     python -m benchmarks.bench [--scenes DIR] [--size 96] [--only name,...] [--out out/bench] [--quick] [--docs]
 
 A folder of scenes holds `<name>/scene.xml` (parameters integrator and size), `ref_a.exr` and `ref_b.exr`. Each method runs in a process
-of its own, one after the other. Writes `bench.csv`, a plot of time against error a scene and `bench.md`; the last lines printed are the
-speed-up of deepclouds at equal error, scene by scene, and the medians of the scenes under suns alone and of those under an environment.
+of its own, one after the other, and deepclouds once with each released model that was trained on the scene's medium: first the one that
+it takes by itself. Writes `bench.csv`, a plot of time against error a scene and `bench.md`; the last lines printed are the speed-up of
+deepclouds at equal error, scene by scene, and the medians of the scenes under suns alone and of those under an environment: of each model,
+and in the last line of the models that it takes by itself.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import platform
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-from benchmarks.equal_error import Bounded, Timing, interpolated_seconds, unbiased_seconds
+import numpy as np
+from deepclouds_runtime.predictor import RELEASED, find_model
+from numpy.typing import NDArray
+
+from benchmarks.bench_plots import write_plots
+from benchmarks.bench_rows import Row, label, markdown, medians, models, speed_ups, write_csv
 from benchmarks.page import write_results
-from benchmarks.worker import DEFAULT_SPP, METHODS
+from benchmarks.worker import DEFAULT_SPP, METHODS, OURS
 from deepclouds.errors import InputError
 from deepclouds.exr import read_exr
-from deepclouds.metrics import ErrorReport, error_report
-from deepclouds.replacing import replacing
+from deepclouds.metrics import error_report
 
 ROOT = Path(__file__).resolve().parent.parent
-_LABELS = {
-    "deepclouds": "deepclouds",
-    "reference": "deepclouds, every sample asks",
-    "volpath": "volpath",
-    "oidn": "volpath + OIDN",
-    "single": "single scattering",
-}
 
 
 @dataclass(frozen=True)
-class Row:
-    """One image of one method: what it cost and how wrong it is."""
+class Plan:
+    """What is run on every scene: methods, models for those that ask one (None: deepclouds' own choice), and samples a pixel of
+    deepclouds and, at the references' size, of its peers; the first seed; the folder of images.
+    """
 
-    method: str
-    scene: str
-    spp: int
-    seconds_warm: float
-    seconds_cold: float | None
-    report: ErrorReport
-
-    @property
-    def spp_text(self) -> str:
-        """The spp, or the word for a renderer's own choice."""
-        return "default" if self.spp == DEFAULT_SPP else str(self.spp)
+    methods: Sequence[str]
+    models: Sequence[str | None]
+    ours: Sequence[int]
+    peers: Sequence[int]
+    seed: int
+    out: Path
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -71,7 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--spp", help="spp of the peers at the references' size, fewer for more pixels (default 16,64,256; with --quick 4,16)"
     )
     parser.add_argument("--ours", help="spp of deepclouds, 0 for its own choice (default 0,1,4,16; with --quick 0)")
-    parser.add_argument("--model", help="another model for deepclouds than the released one")
+    parser.add_argument(
+        "--models",
+        help="comma-separated names or files of models; by default the one that deepclouds takes by itself, then the other released ones "
+        f"({', '.join(RELEASED)}; with --quick the former alone)",
+    )
     parser.add_argument("--seed", type=int, default=7, help="first seed (default %(default)s); share none with the references")
     parser.add_argument("--out", type=Path, default=Path("out/bench"), help="folder for images, table and plots (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help="few samples: a check that it runs, not a measurement")
@@ -85,8 +85,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     # The denoised run holds the noisy images too: tracing them twice would only cost time.
     if "oidn" in methods and "volpath" in methods:
         methods.remove("volpath")
-    peers = _spp_list("--spp", options.spp or ("4,16" if options.quick else "16,64,256"), least=1)
-    ours = _spp_list("--ours", options.ours or ("0" if options.quick else "0,1,4,16"), least=0)
+    asked: list[str | None] = [None] if options.quick else [None, *RELEASED]
+    if options.models:
+        asked = [*options.models.split(",")]
+        for model in asked:
+            find_model(model)
+    plan = Plan(
+        methods,
+        asked,
+        _spp_list("--ours", options.ours or ("0" if options.quick else "0,1,4,16"), least=0),
+        _spp_list("--spp", options.spp or ("4,16" if options.quick else "16,64,256"), least=1),
+        options.seed,
+        options.out,
+    )
 
     print(machine())
     rows: list[Row] = []
@@ -97,20 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         size = options.size or (side if options.quick else max(96, side))
         if size % side:
             raise InputError(f"--size {size} is not a multiple of the references of {scene.name}, {side} x {side}")
-        for method in methods:
-            folder = options.out / scene.name
-            # As many samples in all, whatever the number of pixels that they are spread over.
-            spps = ours if method == "deepclouds" else sorted({max(1, spp * side**2 // size**2) for spp in peers})
-            problem = run_worker(method, scene / "scene.xml", size, spps, options.seed, folder, options.model)
-            if problem is not None:
-                failures.append(f"{scene.name}: {_LABELS[method]} did not run: {problem}")
-                print(failures[-1], file=sys.stderr)
-                continue
-            for entry in json.loads((folder / f"{method}.json").read_text()):
-                image = read_exr(folder / entry["file"]).rgb()
-                report = error_report(image, *references, flip=find_spec("flip_evaluator") is not None)
-                rows.append(Row(entry["method"], scene.name, entry["spp"], entry["seconds_warm"], entry["seconds_cold"], report))
-                print(_line(rows[-1]), flush=True)
+        measure(scene, size, references, plan, rows, failures)
     write_csv(options.out / "bench.csv", rows)
     table = markdown(rows)
     (options.out / "bench.md").write_text(f"{machine()}\n\n{table}\n")
@@ -119,9 +117,42 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_docs(rows, table)
     print(f"wrote {options.out}/bench.csv, bench.md" + (f" and {plotted} plots" if plotted else "; no plots: matplotlib is missing"))
     kinds = {scene.name: light_of(scene / "scene.xml") for scene in scenes}
-    for line in [*failures, *speed_ups(rows), medians(rows, kinds)]:
+    of_each = [medians(rows, kinds, model) for model in models(rows)]
+    for line in [*failures, *speed_ups(rows), *(of_each if len(of_each) > 1 else []), medians(rows, kinds)]:
         print(line)
     return 1 if failures else 0
+
+
+def measure(
+    scene: Path, size: int, references: Sequence[NDArray[np.floating[Any]]], plan: Plan, rows: list[Row], failures: list[str]
+) -> None:
+    """Run every method on one scene and add its rows, and what failed, in words."""
+    # As many samples in all, whatever the number of pixels that they are spread over.
+    spread = sorted({max(1, spp * len(references[0]) ** 2 // size**2) for spp in plan.peers})
+    # Octaves have no choice of their own.
+    spps = {"deepclouds": plan.ours, "corrected": [DEFAULT_SPP], "octaves": [n for n in plan.ours if n != DEFAULT_SPP] or [4]}
+    for method in plan.methods:
+        measured: list[str] = []
+        for model in plan.models if method in OURS else [None]:
+            name = "" if model is None else model_name(model)
+            if name in measured:
+                continue
+            folder = plan.out / scene.name / name
+            problem = run_worker(method, scene / "scene.xml", size, spps.get(method, spread), plan.seed, folder, model)
+            if problem is not None:
+                failures.append(f"{scene.name}: {label(method, name)} did not run: {problem}")
+                print(failures[-1], file=sys.stderr)
+                continue
+            entries = json.loads((folder / f"{method}.json").read_text())
+            if not entries:
+                print(f"{scene.name}: {label(method, name)} was left out: the model was not trained on such a medium")
+            for entry in entries:
+                image = read_exr(folder / entry["file"]).rgb()
+                report = error_report(image, *references, flip=find_spec("flip_evaluator") is not None)
+                seconds = entry["seconds_warm"], entry["seconds_cold"]
+                rows.append(Row(entry["method"], scene.name, entry["spp"], *seconds, report, entry["model"]))
+                measured.append(entry["model"])
+                print(_line(rows[-1]), flush=True)
 
 
 def find_scenes(folder: Path, only: str | None) -> list[Path]:
@@ -161,6 +192,11 @@ def run_worker(method: str, scene: Path, size: int, spps: Sequence[int], seed: i
     return lines[-1] if lines else f"exit code {done.returncode}"
 
 
+def model_name(model: str) -> str:
+    """What a model is called in results: a released one's name, a file's without folder and suffix."""
+    return Path(model).stem
+
+
 def machine() -> str:
     """One line on where this runs: processor, usable cores, load, versions."""
     try:
@@ -180,158 +216,10 @@ def machine() -> str:
     )
 
 
-def equal_error(rows: Sequence[Row], ours: Row, error: float | None = None) -> dict[str, Bounded]:
-    """Seconds that each peer needs on the scene of `ours` to reach an error (default: that of `ours`)."""
-    target = ours.report.rrmse if error is None else error
-    peers: dict[str, Bounded] = {}
-    for method, seconds in (("volpath", unbiased_seconds), ("oidn", interpolated_seconds)):
-        timings = [Timing(r.seconds_warm, r.report.rrmse) for r in rows if (r.method, r.scene) == (method, ours.scene)]
-        if timings and target > 0 and all(t.error > 0 for t in timings):
-            peers[method] = seconds(timings, target)
-    return peers
-
-
-def speed_ups(rows: Sequence[Row]) -> list[str]:
-    """One line a scene: deepclouds' time and error, what its peers need to the same error, and the ratios.
-
-    The row with deepclouds' own choice of samples counts, else the one with most. The range in brackets is the ratio at both ends of
-    the interval of deepclouds' error.
-    """
-    lines = []
-    for scene in dict.fromkeys(r.scene for r in rows):
-        candidates = [r for r in rows if r.scene == scene and r.method == "deepclouds"]
-        if not candidates:
-            lines.append(f"{scene}: no speed-up, deepclouds was not run")
-            continue
-        ours = next((r for r in candidates if r.spp == DEFAULT_SPP), max(candidates, key=lambda r: r.spp))
-        parts = []
-        for method, needed in equal_error(rows, ours).items():
-            low, high = (equal_error(rows, ours, e).get(method) for e in reversed(ours.report.rrmse_interval))
-            spread = f" [{low.over(ours.seconds_warm)}, {high.over(ours.seconds_warm)}]" if low is not None and high is not None else ""
-            parts.append(f"{needed.over(ours.seconds_warm)} x{spread} against {_LABELS[method]} ({needed} s)")
-        reached = f"{scene}: deepclouds reaches {100 * ours.report.rrmse:.2f} % in {ours.seconds_warm:.3g} s"
-        lines.append(f"{reached}; at equal error {'; '.join(parts)}" if parts else f"{reached}; no peer to compare with")
-    return lines
-
-
 def light_of(scene: Path) -> str:
     """What lights a scene file: "environment", or "sun" where there is none."""
     kinds = {emitter.get("type") for emitter in ElementTree.parse(scene).getroot().iter("emitter")}
     return "environment" if kinds & {"envmap", "constant"} else "sun"
-
-
-def medians(rows: Sequence[Row], kinds: Mapping[str, str]) -> str:
-    """Medians over scenes of the speed-up at equal error, under suns alone and under an environment."""
-
-    def median(kind: str, method: str) -> str:
-        ratios = []
-        for scene in (s for s in dict.fromkeys(r.scene for r in rows) if kinds[s] == kind):
-            candidates = [r for r in rows if (r.scene, r.method) == (scene, "deepclouds")]
-            if not candidates:
-                continue
-            ours = next((r for r in candidates if r.spp == DEFAULT_SPP), max(candidates, key=lambda r: r.spp))
-            needed = equal_error(rows, ours).get(method)
-            if needed is not None:
-                ratios.append(needed.over(ours.seconds_warm))
-        if not ratios:
-            return "unknown"
-        ratios.sort(key=lambda r: r.value)
-        low, high = ratios[(len(ratios) - 1) // 2], ratios[len(ratios) // 2]
-        bounds = {b for b in (low.bound, high.bound) if b}
-        return str(Bounded(0.5 * (low.value + high.value), bounds.pop() if len(bounds) == 1 else ""))
-
-    sun = f"sun {median('sun', 'volpath')} x volpath, {median('sun', 'oidn')} x volpath+OIDN"
-    return f"speed: {sun}; environment {median('environment', 'volpath')} x volpath"
-
-
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write one line an image; fractions, not per cent; an empty field is a figure that was not measured."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    names = ["method", "scene", "spp", "seconds_warm", "seconds_cold", "rrmse", "rrmse_low", "rrmse_high"]
-    names += ["energy", "energy_low", "energy_high", "dark_energy", "worst_tile", "flip"]
-
-    with replacing(path, ".csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        for row in rows:
-            r = row.report
-            cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.6g}"
-            figures = [r.rrmse, *r.rrmse_interval, r.energy, *r.energy_interval, r.dark_energy, r.worst_tile]
-            texts = [f"{x:.6g}" for x in figures] + ["" if r.flip is None else f"{r.flip:.6g}"]
-            writer.writerow([row.method, row.scene, row.spp_text, f"{row.seconds_warm:.6g}", cold, *texts])
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """Lay the rows out as a table, in per cent, with the time that the peers need to the error of each deepclouds row."""
-    lines = [
-        "| scene | method | spp | warm s | cold s | rRMSE % | energy % | worst tile % | FLIP | volpath to the same | OIDN to the same |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        r = row.report
-        interval = f"{100 * r.rrmse:.2f} [{100 * r.rrmse_interval[0]:.2f}, {100 * r.rrmse_interval[1]:.2f}]"
-        energy = f"{100 * r.energy:+.2f} [{100 * r.energy_interval[0]:+.2f}, {100 * r.energy_interval[1]:+.2f}]"
-        peers = equal_error(rows, row) if row.method in ("deepclouds", "reference") else {}
-        needed = [f"{peers[m]} s ({peers[m].over(row.seconds_warm)} x)" if m in peers else "" for m in ("volpath", "oidn")]
-        cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.3g}"
-        flip = "" if r.flip is None else f"{r.flip:.4f}"
-        cells = [
-            row.scene,
-            _LABELS[row.method],
-            row.spp_text,
-            f"{row.seconds_warm:.3g}",
-            cold,
-            interval,
-            energy,
-            f"{100 * r.worst_tile:+.1f}",
-            flip,
-        ]
-        lines.append("| " + " | ".join([*cells, *needed]) + " |")
-    return "\n".join(lines)
-
-
-def write_plots(folder: Path, rows: Sequence[Row]) -> int:
-    """Write `bench_<scene>.png`, time against error; returns how many, 0 without matplotlib."""
-    if find_spec("matplotlib") is None:
-        return 0
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    scenes = list(dict.fromkeys(r.scene for r in rows))
-    folder.mkdir(parents=True, exist_ok=True)
-    styles = {
-        "deepclouds": ("#b3122a", "o"),
-        "reference": ("#d98a94", "D"),
-        "volpath": ("#444444", "s"),
-        "oidn": ("#2a55a8", "^"),
-        "single": ("#b08a2e", "x"),
-    }
-    for scene in scenes:
-        figure = Figure(figsize=(5.2, 3.9), dpi=130, layout="constrained")
-        FigureCanvasAgg(figure)
-        axis = figure.subplots()
-        for method, (colour, marker) in styles.items():
-            points = sorted(
-                (r for r in rows if (r.scene, r.method) == (scene, method) and r.report.rrmse > 0), key=lambda r: r.seconds_warm
-            )
-            if not points:
-                continue
-            errors = [100 * p.report.rrmse for p in points]
-            bars = [
-                [e - 100 * p.report.rrmse_interval[0] for e, p in zip(errors, points, strict=True)],
-                [100 * p.report.rrmse_interval[1] - e for e, p in zip(errors, points, strict=True)],
-            ]
-            bars = [[max(0.0, b) for b in side] for side in bars]
-            axis.errorbar(
-                [p.seconds_warm for p in points], errors, bars, color=colour, marker=marker, capsize=2, lw=1.2, label=_LABELS[method]
-            )
-        axis.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="rRMSE, %", title=scene)
-        axis.grid(which="both", color="#dddddd", lw=0.5)
-        axis.legend(frameon=False, fontsize=8)
-
-        with replacing(folder / f"bench_{scene}.png", ".png") as temporary:
-            figure.savefig(temporary, format="png")
-    return len(scenes)
 
 
 def write_docs(rows: Sequence[Row], table: str, docs: Path = ROOT / "docs") -> None:
@@ -363,7 +251,7 @@ def _line(row: Row) -> str:
     r = row.report
     cold = "" if row.seconds_cold is None else f", cold {row.seconds_cold:.3g} s"
     return (
-        f"{row.scene:16} {_LABELS[row.method]:17} {row.spp_text:>7} spp  {row.seconds_warm:8.3g} s{cold}  "
+        f"{row.scene:16} {row.label:36} {row.spp_text:>7} spp  {row.seconds_warm:8.3g} s{cold}  "
         f"rRMSE {100 * r.rrmse:.2f} % [{100 * r.rrmse_interval[0]:.2f}, {100 * r.rrmse_interval[1]:.2f}]  energy {100 * r.energy:+.2f} %"
     )
 

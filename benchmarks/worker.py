@@ -2,10 +2,11 @@
 
     python -m benchmarks.worker METHOD scene.xml --size 96 --spp 16,64 --seed 7 --out folder
 
-METHOD is deepclouds (its fast mode), reference (its method as published: every sample asks the network), volpath, oidn (volpath and its
-denoised image) or single (single scattering). Writes one EXR an image and `METHOD.json`: for each image its method, spp, file, seconds
-warm and seconds cold. Warm: scene, kernels and model are loaded, all work that depends on the sun or the camera included. Cold: what a
-first image costs a fresh process, imports and loading included.
+METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), reference (its method as published: every sample
+asks the network), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its denoised image) or single (single scattering). Writes one
+EXR an image and `METHOD.json`: for each image its method, model, spp, file, seconds warm and seconds cold; nothing for a model that was
+asked for by name and was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all work that depends on the sun or
+the camera included. Cold: what a first image costs a fresh process, imports and loading included.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import json
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,9 @@ from deepclouds.errors import InputError
 from deepclouds.exr import write_exr
 
 Image = NDArray[np.float32]
-METHODS = ("deepclouds", "reference", "volpath", "oidn", "single")
+# Modes of deepclouds, which ask a model, and all methods.
+OURS = ("deepclouds", "corrected", "reference")
+METHODS = (*OURS, "octaves", "volpath", "oidn", "single")
 # The spp that stands for "what the renderer chooses itself".
 DEFAULT_SPP = 0
 
@@ -40,14 +43,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, required=True)
     parser.add_argument("--spp", required=True, help="comma-separated; 0: the renderer's own default (deepclouds only)")
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--model", help="deepclouds: another model than the released one")
+    parser.add_argument("--model", help="deepclouds: name or file of a model (default: its own choice)")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(argv)
     spps = [int(s) for s in options.spp.split(",")]
     options.out.mkdir(parents=True, exist_ok=True)
-    if options.method in ("deepclouds", "reference"):
-        mode = "fast" if options.method == "deepclouds" else "reference"
-        rows = render_deepclouds(options.scene, options.size, spps, options.seed, options.out, options.model, mode)
+    if options.method in OURS:
+        rows = render_deepclouds(options.method, options.scene, options.size, spps, options.seed, options.out, options.model)
+    elif options.method == "octaves":
+        rows = render_octaves(options.scene, options.size, spps, options.seed, options.out)
     else:
         rows = render_peer(options.method, options.scene, options.size, spps, options.seed, options.out)
     (options.out / f"{options.method}.json").write_text(json.dumps(rows))
@@ -55,26 +59,52 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def render_deepclouds(
-    scene: Path, size: int, spps: list[int], seed: int, out: Path, model: str | None, mode: str = "fast"
+    method: str, scene: Path, size: int, spps: list[int], seed: int, out: Path, model: str | None
 ) -> list[dict[str, Any]]:
-    """Time the runtime: the second call with another seed is the warm one. The clock is ours; only the loading time is its own word."""
+    """Time the runtime: the second render with another seed is the warm one."""
     start = time.perf_counter()
-    runtime: Any = import_module("deepclouds_runtime")
-    imports = time.perf_counter() - start
+    loading: Any = import_module("deepclouds_runtime.loading")
+    mode = "reference" if method == "reference" else "fast"
+    renderer = loading.load(scene, defines={"size": str(size)}, model=model, mode=mode)
+    loaded = time.perf_counter() - start
+    # Without weights, paths are traced in the network's place.
+    if renderer.model_hash is None and model is not None:
+        return []
+    name = "walks" if renderer.model_hash is None else renderer.predictor.path.stem
+
+    def render(spp: int, seed: int) -> Image:
+        result = renderer.render(None if spp == DEFAULT_SPP else spp, seed, correct=method == "corrected")
+        return np.asarray(result.rgb, dtype=np.float32)[..., :3]
+
+    return _twice(render, method, name, spps, seed, loaded, out)
+
+
+def render_octaves(scene: Path, size: int, spps: list[int], seed: int, out: Path) -> list[dict[str, Any]]:
+    """Time octaves as the runtime is timed."""
+    start = time.perf_counter()
+    from deepclouds_runtime._mitsuba import mitsuba
+    from deepclouds_runtime.loading import load_xml
+    from deepclouds_runtime.scene import read_scene
+
+    from benchmarks.octaves import OctaveRenderer
+
+    mitsuba(select=True)
+    renderer = OctaveRenderer(read_scene(load_xml(scene, {"size": str(size)})))
+    return _twice(renderer.render, "octaves", "", spps, seed, time.perf_counter() - start, out)
+
+
+def _twice(
+    render: Callable[[int, int], Image], method: str, model: str, spps: list[int], seed: int, loaded: float, out: Path
+) -> list[dict[str, Any]]:
+    """Render each spp with two seeds: the first image of all is cold, every second one warm."""
     rows = []
     for index, spp in enumerate(spps):
-        asked = None if spp == DEFAULT_SPP else spp
         seconds = []
         for repeat in range(2):
             start = time.perf_counter()
-            result = runtime.render(
-                str(scene), spp=asked, seed=seed + 2 * index + repeat, defines={"size": str(size)}, model=model, mode=mode
-            )
-            rgb = np.asarray(result.rgb, dtype=np.float32)[..., :3]
-            elapsed = time.perf_counter() - start
-            seconds.append((elapsed, max(0.0, elapsed - result.seconds.get("load", 0.0))))
-        cold = imports + seconds[0][0] if index == 0 else None
-        rows.append(_row("deepclouds" if mode == "fast" else "reference", spp, rgb, seconds[1][1], cold, out))
+            image = render(spp, seed + 2 * index + repeat)
+            seconds.append(time.perf_counter() - start)
+        rows.append(_row(method, spp, image, seconds[1], loaded + seconds[0] if index == 0 else None, out, model))
     return rows
 
 
@@ -133,10 +163,10 @@ def load_volpath(mi: Any, scene: Path, size: int, max_depth: int) -> Any:
     return mi.load_string(ElementTree.tostring(root, encoding="unicode"), integrator="volpath", size=str(size))
 
 
-def _row(method: str, spp: int, image: Image, warm: float, cold: float | None, out: Path) -> dict[str, Any]:
+def _row(method: str, spp: int, image: Image, warm: float, cold: float | None, out: Path, model: str = "") -> dict[str, Any]:
     path = out / f"{method}_{spp}.exr"
     write_exr(path, {c: image[..., i] for i, c in enumerate("RGB")}, {"spp": spp, "seconds": warm})
-    return {"method": method, "spp": spp, "file": path.name, "seconds_warm": warm, "seconds_cold": cold}
+    return {"method": method, "model": model, "spp": spp, "file": path.name, "seconds_warm": warm, "seconds_cold": cold}
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -13,10 +14,12 @@ import numpy as np
 import pytest
 
 from benchmarks import bench, make_scenes, worker
+from benchmarks.bench_plots import write_plots
+from benchmarks.bench_rows import Row, compared, markdown, medians, models, speed_ups, write_csv
 from benchmarks.equal_error import Timing, interpolated_seconds, unbiased_seconds
 from benchmarks.page import marks
 from deepclouds.errors import InputError
-from deepclouds.exr import read_exr
+from deepclouds.exr import read_exr, write_exr
 from deepclouds.metrics import ErrorReport, error_report
 from deepclouds.volume import read_vol
 
@@ -29,8 +32,8 @@ def report(error: float) -> ErrorReport:
     return error_report(a * (1 + error * signs), a, a)
 
 
-def row(method: str, spp: int, seconds: float, error: float) -> bench.Row:
-    return bench.Row(method, "s", spp, seconds, None, report(error))
+def row(method: str, spp: int, seconds: float, error: float, model: str = "", scene: str = "s") -> Row:
+    return Row(method, scene, spp, seconds, None, report(error), model)
 
 
 def test_unbiased_time_is_quadratic() -> None:
@@ -63,12 +66,12 @@ def test_beyond_its_points_the_denoiser_gets_a_bound() -> None:
 
 def test_speed_up_lines() -> None:
     rows = [row("volpath", 16, 2.0, 0.4), row("oidn", 16, 2.0, 0.05), row("deepclouds", 0, 0.5, 0.1), row("deepclouds", 64, 5.0, 0.09)]
-    (line,) = bench.speed_ups(rows)
+    (line,) = speed_ups(rows)
     # volpath: 2 s * (0.4 / 0.1)^2 = 32 s, 64 times 0.5 s. The denoiser is better than we are from its first point on.
     assert line.startswith("s: deepclouds reaches 10.00 % in 0.5 s; at equal error 64 x [64, 64] against volpath (32 s)")
     assert "<= 4 x" in line
-    assert bench.speed_ups(rows[:2]) == ["s: no speed-up, deepclouds was not run"]
-    table = bench.markdown(rows)
+    assert speed_ups(rows[:2]) == ["s: no speed-up, deepclouds was not run"]
+    table = markdown(rows)
     assert "32 s (64 x)" in table
     assert "| default |" in table
     assert len(table.splitlines()) == 2 + len(rows)
@@ -78,8 +81,8 @@ def test_medians_of_scenes_by_what_lights_them() -> None:
     rows = []
     for scene, seconds in (("a", 0.5), ("b", 0.25), ("c", 1.0), ("sky", 2.0)):
         for method, spp, warm, error in (("volpath", 16, 2.0, 0.4), ("oidn", 16, 2.0, 0.05), ("deepclouds", 0, seconds, 0.1)):
-            rows.append(bench.Row(method, scene, spp, warm, None, report(error)))
-    line = bench.medians(rows, {"a": "sun", "b": "sun", "c": "sun", "sky": "environment"})
+            rows.append(Row(method, scene, spp, warm, None, report(error)))
+    line = medians(rows, {"a": "sun", "b": "sun", "c": "sun", "sky": "environment"})
     # 32 s over 0.5, 0.25 and 1 s; the denoiser is better than we are from its first point, 2 s, on.
     assert line == "speed: sun 64 x volpath, <= 4 x volpath+OIDN; environment 16 x volpath"
     assert {bench.light_of(SCENES / name / "scene.xml") for name in ("heap_sun", "ball_isotropic")} == {"sun"}
@@ -92,7 +95,7 @@ def test_results_replace_only_what_lies_between_the_marks(tmp_path: Path) -> Non
     (tmp_path / "images").mkdir()
     rows = [row("volpath", 16, 2.0, 0.4), row("deepclouds", 0, 0.5, 0.1)]
     for _ in range(2):
-        bench.write_docs(rows, bench.markdown(rows), tmp_path)
+        bench.write_docs(rows, markdown(rows), tmp_path)
         text = page.read_text()
         assert text.startswith("before\n" + marks("bench")[0])
         assert text.endswith(marks("bench")[1] + "\nafter\n")
@@ -144,21 +147,39 @@ def test_scenes_are_looked_up_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_peers_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Expected behaviour: volpath is unbiased and gets better with samples, denoising helps, single scattering lacks energy."""
+    """Expected behaviour: volpath is unbiased and gets better with samples, denoising helps, single scattering lacks energy.
+
+    Octaves lie between.
+    """
     pytest.importorskip("mitsuba")
     pytest.importorskip("mitsuba_oidn")
     code = bench.main(
-        ["--only", "ball_isotropic", "--methods", "volpath,oidn,single", "--spp", "4,32", "--size", "48", "--out", str(tmp_path)]
+        [
+            "--only",
+            "ball_isotropic",
+            "--methods",
+            "octaves,volpath,oidn,single",
+            "--ours",
+            "2",
+            "--spp",
+            "4,32",
+            "--size",
+            "48",
+            "--out",
+            str(tmp_path),
+        ]
     )
     assert code == 0
     with open(tmp_path / "bench.csv", newline="", encoding="utf-8") as file:
         rows = {(r["method"], r["spp"]): r for r in csv.DictReader(file)}
-    assert set(rows) == {(m, s) for m in ("volpath", "oidn", "single") for s in ("4", "32")}
+    assert set(rows) == {("octaves", "2"), *((m, s) for m in ("volpath", "oidn", "single") for s in ("4", "32"))}
     error = {key: float(r["rrmse"]) for key, r in rows.items()}
     assert error["volpath", "4"] / error["volpath", "32"] == pytest.approx(math.sqrt(8), rel=0.25)
     assert error["oidn", "4"] < 0.5 * error["volpath", "4"]
     assert abs(float(rows["volpath", "32"]["energy"])) < 0.05
     assert float(rows["single", "32"]["energy"]) < -0.4
+    # Octaves add what single scattering lacks, and are far from path tracing all the same.
+    assert error["oidn", "32"] < error["octaves", "2"] < error["single", "32"]
     assert all(float(r["seconds_warm"]) > 0 and float(r["seconds_cold"]) > float(r["seconds_warm"]) for r in rows.values())
     assert capsys.readouterr().out.strip().splitlines()[-2] == "ball_isotropic: no speed-up, deepclouds was not run"
     assert (tmp_path / "bench.md").is_file()
@@ -175,36 +196,146 @@ def test_a_method_that_fails_is_named_and_the_rest_goes_on(tmp_path: Path, capsy
     finally:
         patch.undo()
     out = capsys.readouterr().out.strip().splitlines()
-    assert sum("did not run: ModuleNotFoundError" in line for line in out) == 4
+    assert sum("did not run: ModuleNotFoundError" in line for line in out) == 6
     assert out[-1] == "speed: sun unknown x volpath, unknown x volpath+OIDN; environment unknown x volpath"
-    assert (tmp_path / "bench.csv").read_text().splitlines()[0].startswith("method,scene,spp")
+    assert (tmp_path / "bench.csv").read_text().splitlines()[0].startswith("method,model,scene,spp")
 
 
-def test_the_runtime_is_timed_without_its_loading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Expected behaviour: two calls a setting with different seeds; the second is the warm one, less the loading it reports."""
-    calls: list[dict[str, object]] = []
+def test_the_runtime_is_loaded_once_and_timed_warm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected behaviour: two renders a setting with different seeds, of which the second is the warm one; the first pays for loading."""
+    loads: list[dict[str, object]] = []
+    renders: list[tuple[object, ...]] = []
     clock = [10.0]
     monkeypatch.setattr("benchmarks.worker.time.perf_counter", lambda: clock[0])
 
-    def render(scene: str, **options: object) -> SimpleNamespace:
-        calls.append(options)
-        clock[0] += 0.2 if len(calls) % 2 else 0.19
-        return SimpleNamespace(rgb=np.full((8, 8, 3), float(len(calls))), seconds={"load": 0.15, "total": 0.05})
+    def render(spp: int | None, seed: int, *, correct: bool) -> SimpleNamespace:
+        renders.append((spp, seed, correct))
+        clock[0] += 0.05 if len(renders) % 2 else 0.04
+        return SimpleNamespace(rgb=np.full((8, 8, 3), float(len(renders))))
 
-    runtime = ModuleType("deepclouds_runtime")
-    monkeypatch.setattr(runtime, "render", render, raising=False)
-    monkeypatch.setitem(sys.modules, "deepclouds_runtime", runtime)
-    arguments = ["deepclouds", "scene.xml", "--size", "8", "--spp", "0,16", "--seed", "5", "--out", str(tmp_path)]
-    assert worker.main(arguments) == 0
-    assert [c["spp"] for c in calls] == [None, None, 16, 16]
-    assert len({c["seed"] for c in calls}) == 4
-    assert all(c["defines"] == {"size": "8"} and c["model"] is None for c in calls)
+    def load(scene: Path, **options: object) -> SimpleNamespace:
+        loads.append(options)
+        clock[0] += 0.15
+        known = None if options["model"] == "stranger" else "0" * 64
+        return SimpleNamespace(render=render, model_hash=known, predictor=SimpleNamespace(path=Path("somewhere/first.onnx")))
+
+    runtime = ModuleType("deepclouds_runtime.loading")
+    monkeypatch.setattr(runtime, "load", load, raising=False)
+    monkeypatch.setitem(sys.modules, "deepclouds_runtime.loading", runtime)
+    arguments = ["scene.xml", "--size", "8", "--spp", "0,16", "--seed", "5", "--out", str(tmp_path)]
+    assert worker.main(["deepclouds", *arguments]) == 0
+    assert loads == [{"defines": {"size": "8"}, "model": None, "mode": "fast"}]
+    assert [r[0] for r in renders] == [None, None, 16, 16]
+    assert len({r[1] for r in renders}) == 4
+    assert not any(r[2] for r in renders)
     default, fixed = json.loads((tmp_path / "deepclouds.json").read_text())
     assert (default["spp"], fixed["spp"]) == (0, 16)
+    assert {default["model"], fixed["model"]} == {"first"}
     assert default["seconds_cold"] == pytest.approx(0.2)
     assert default["seconds_warm"] == fixed["seconds_warm"] == pytest.approx(0.04)
     assert fixed["seconds_cold"] is None
     np.testing.assert_array_equal(read_exr(tmp_path / fixed["file"]).rgb(), 4.0)
+    assert worker.main(["corrected", *arguments]) == 0
+    assert all(r[2] for r in renders[4:])
+    assert worker.main(["reference", *arguments]) == 0
+    assert loads[-1]["mode"] == "reference"
+    # One that was asked for by name and does not know the medium would be measured as walks.
+    count = len(renders)
+    assert worker.main(["deepclouds", *arguments, "--model", "stranger"]) == 0
+    assert json.loads((tmp_path / "deepclouds.json").read_text()) == []
+    assert len(renders) == count
+
+
+def test_each_model_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Expected behaviour: the product's own choice first, then the released models that it did not choose; one may be left out.
+
+    The last line is of the own choice; every model has a line of its own before.
+    """
+    asked: list[tuple[str, str | None]] = []
+
+    def run(method: str, scene: Path, size: int, spps: Sequence[int], seed: int, out: Path, model: str | None) -> None:
+        asked.append((method, model))
+        out.mkdir(parents=True, exist_ok=True)
+        rows = []
+        name = {"deepclouds": model or "b", "corrected": model or "b"}.get(method, "")
+        truth = read_exr(scene.parent / "ref_a.exr").rgb()
+        for spp in [] if model == "stranger" else spps:
+            file = f"{method}_{spp}.exr"
+            write_exr(out / file, {c: 1.5 * truth[..., i] for i, c in enumerate("RGB")})
+            warm = 0.5 if name == "b" else 0.25
+            rows.append({"method": method, "model": name, "spp": spp, "file": file, "seconds_warm": warm, "seconds_cold": None})
+        (out / f"{method}.json").write_text(json.dumps(rows))
+
+    monkeypatch.setattr(bench, "run_worker", run)
+    monkeypatch.setattr(bench, "RELEASED", ("a", "b", "stranger"))
+    arguments = [
+        "--only",
+        "ball_isotropic",
+        "--methods",
+        "deepclouds,corrected,octaves,volpath",
+        "--ours",
+        "0,2",
+        "--spp",
+        "16",
+        "--out",
+        str(tmp_path),
+    ]
+    assert bench.main(arguments) == 0
+    assert asked == [(m, model) for m in ("deepclouds", "corrected") for model in (None, "a", "stranger")] + [
+        ("octaves", None),
+        ("volpath", None),
+    ]
+    out = capsys.readouterr().out
+    assert "ball_isotropic: deepclouds stranger was left out: the model was not trained on such a medium" in out
+    ends = out.strip().splitlines()[-3:]
+    # volpath's error is ours here, at a quarter of a second: half of our time with b, the same as ours with a.
+    assert ends[0] == "b, speed: sun 0.5 x volpath, unknown x volpath+OIDN; environment unknown x volpath"
+    assert ends[1] == "a, speed: sun 1 x volpath, unknown x volpath+OIDN; environment unknown x volpath"
+    assert ends[2] == ends[0].removeprefix("b, ")
+    with open(tmp_path / "bench.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["method"], r["model"], r["spp"]) for r in rows[:6]] == [
+        ("deepclouds", "b", "default"),
+        ("deepclouds", "b", "2"),
+        ("deepclouds", "a", "default"),
+        ("deepclouds", "a", "2"),
+        ("corrected", "b", "default"),
+        ("corrected", "a", "default"),
+    ]
+    assert [(r["method"], r["spp"]) for r in rows[6:]] == [("octaves", "2"), ("volpath", "4")]
+    assert all(len(r) == 15 and None not in r.values() for r in rows)
+    asked.clear()
+    monkeypatch.setattr(bench, "find_model", lambda model: model)
+    assert bench.main([*arguments, "--models", "a,work/c.onnx", "--methods", "deepclouds"]) == 0
+    assert asked == [("deepclouds", "a"), ("deepclouds", "work/c.onnx")]
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="no released model is named 'nobody'"):
+        bench.main(["--models", "nobody"])
+
+
+def test_models_are_told_apart(tmp_path: Path) -> None:
+    rows = [row("volpath", 16, 2.0, 0.4), row("deepclouds", 0, 0.5, 0.1, "a"), row("deepclouds", 4, 0.6, 0.1, "b")]
+    rows += [row("corrected", 0, 2.0, 0.05, "a"), row("deepclouds", 0, 1.0, 0.1, "b", "t"), row("volpath", 16, 2.0, 0.4, scene="t")]
+    assert models(rows) == ["a", "b"]
+    assert models(rows, "t") == ["b"]
+    assert compared(rows, "s") is rows[1]
+    assert compared(rows, "s", "b") is rows[2]
+    assert compared(rows, "t", "a") is None
+    first, second, third = speed_ups(rows)
+    assert first.startswith("s: deepclouds a reaches 10.00 % in 0.5 s; at equal error 64 x")
+    assert second.startswith("s: deepclouds b reaches 10.00 % in 0.6 s")
+    assert third.startswith("t: deepclouds b")
+    table = markdown(rows)
+    assert "| deepclouds a, corrected | default |" in table
+    kinds = {"s": "sun", "t": "environment"}
+    assert medians(rows, kinds) == "speed: sun 64 x volpath, unknown x volpath+OIDN; environment 32 x volpath"
+    assert medians(rows, kinds, "a") == "a, speed: sun 64 x volpath, unknown x volpath+OIDN; environment unknown x volpath"
+    write_csv(tmp_path / "bench.csv", rows)
+    with open(tmp_path / "bench.csv", newline="", encoding="utf-8") as file:
+        assert [r["model"] for r in csv.DictReader(file)] == ["", "a", "b", "a", "b", ""]
+    pytest.importorskip("matplotlib")
+    assert write_plots(tmp_path, rows) == 2
+    assert all((tmp_path / f"bench_{scene}.png").read_bytes().startswith(b"\x89PNG") for scene in "st")
 
 
 def test_a_worker_reports_its_last_complaint(tmp_path: Path) -> None:

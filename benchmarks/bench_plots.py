@@ -1,0 +1,63 @@
+"""Pictures of the benchmark: time against error, a scene each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from benchmarks.bench_rows import Row, label
+from benchmarks.worker import OURS
+from deepclouds.replacing import replacing
+
+# A colour a model, a marker and a line a mode; the peers have both of their own.
+_MODELS = ("#b3122a", "#d9822b", "#7a3b8f", "#8c6d5a")
+_MODES = {"deepclouds": ("o", "-"), "corrected": ("*", "-"), "reference": ("D", ":")}
+_PEERS = {"octaves": ("#3d8a5f", "v"), "volpath": ("#444444", "s"), "oidn": ("#2a55a8", "^"), "single": ("#b08a2e", "x")}
+
+
+def write_plots(folder: Path, rows: Sequence[Row]) -> int:
+    """Write `bench_<scene>.png`, time against error; returns how many, 0 without matplotlib."""
+    if find_spec("matplotlib") is None:
+        return 0
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(r.scene for r in rows))
+    folder.mkdir(parents=True, exist_ok=True)
+    # A model keeps its colour from scene to scene.
+    styles = [
+        (method, model, _MODELS[i % len(_MODELS)], marker, line)
+        for i, model in enumerate(dict.fromkeys(r.model for r in rows if r.method in OURS))
+        for method, (marker, line) in _MODES.items()
+    ]
+    styles += [(method, "", colour, marker, "-") for method, (colour, marker) in _PEERS.items()]
+    for scene in scenes:
+        figure = Figure(figsize=(7.4, 4.0), dpi=130, layout="constrained")
+        FigureCanvasAgg(figure)
+        axis = figure.subplots()
+        for method, model, colour, marker, line in styles:
+            points = sorted(
+                (r for r in rows if (r.scene, r.method, r.model) == (scene, method, model) and r.report.rrmse > 0),
+                key=lambda r: r.seconds_warm,
+            )
+            if not points:
+                continue
+            errors = [100 * p.report.rrmse for p in points]
+            bars = [
+                [e - 100 * p.report.rrmse_interval[0] for e, p in zip(errors, points, strict=True)],
+                [100 * p.report.rrmse_interval[1] - e for e, p in zip(errors, points, strict=True)],
+            ]
+            bars = [[max(0.0, b) for b in side] for side in bars]
+            seconds = [p.seconds_warm for p in points]
+            size = 9 if marker == "*" else 5
+            axis.errorbar(
+                seconds, errors, bars, color=colour, marker=marker, ms=size, ls=line, capsize=2, lw=1.2, label=label(method, model)
+            )
+        axis.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="rRMSE, %", title=scene)
+        axis.grid(which="both", color="#dddddd", lw=0.5)
+        axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+
+        with replacing(folder / f"bench_{scene}.png", ".png") as temporary:
+            figure.savefig(temporary, format="png")
+    return len(scenes)
