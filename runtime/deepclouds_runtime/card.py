@@ -92,6 +92,7 @@ def describe(model: str, figures: Sequence[Path]) -> Subject:
     """Read a model and find its figures: those that name its weights."""
     import onnx
 
+    from deepclouds_runtime.multiply_adds import multiply_adds
     from deepclouds_runtime.predictor import Predictor
 
     predictor = Predictor(model, threads=1)
@@ -100,8 +101,7 @@ def describe(model: str, figures: Sequence[Path]) -> Subject:
         predictor.path.stem,
         predictor.path.stat().st_size,
         sum(a.size for a in arrays),
-        # Every matrix is multiplied once a query.
-        sum(a.size for a in arrays if a.ndim == 2 and a.dtype.kind == "f"),
+        multiply_adds(predictor.path.read_bytes()),
         predictor.metadata,
         _figures(figures, predictor.metadata.initialisers_sha256),
     )
