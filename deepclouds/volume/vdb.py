@@ -160,6 +160,14 @@ def _choose(file: Path, headers: Sequence[_openvdb.Header], grid: str | None) ->
     return matches[0]
 
 
+def chosen_grid(path: str | PathLike[str], grid: str | None = None) -> tuple[list[_openvdb.Header], int]:
+    """Headers of the grids of a .vdb file, and the number of the one that `read_vdb` reads; raises InputError where there is none."""
+    file = _existing(path)
+    with _native_errors(file):
+        headers = _openvdb.read_headers(str(file))
+    return headers, _choose(file, headers, grid)
+
+
 def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = False, dense_voxels: int = DENSE_VOXELS) -> Volume:
     """Read one fog volume, cropped to the box of its active voxels.
 
@@ -186,10 +194,8 @@ def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = F
         when the file is missing or damaged, the name is missing or ambiguous, or the grid is not a fog volume with an affine
         transform and background 0, has no active voxel, or holds values that are no density.
     """
-    file = _existing(path)
-    with _native_errors(file):
-        headers = _openvdb.read_headers(str(file))
-    index = _choose(file, headers, grid)
+    file = Path(path)
+    headers, index = chosen_grid(file, grid)
     source = f"{file}: the grid '{headers[index]['unique_name']}'"
     with _native_errors(file):
         info, density, places, values = _openvdb.read_floats(str(file), index, dense_voxels, MAX_VOXELS, MAX_BOX)

@@ -88,6 +88,28 @@ int main() {
         grid->setTransform(t);
         save("rotated.vdb", {grid});
     }
+    // A fire: smoke, flames as vectors, a temperature that is no Kelvin, and a wind.
+    {
+        FloatGrid::Ptr smoke = fog("density"), temperature = fog("temperature");
+        Vec3SGrid::Ptr flames = Vec3SGrid::create(Vec3s(0));
+        flames->setName("FlameColour");
+        flames->tree().setValue({1, 1, 1}, Vec3s(3, 2, 1));
+        Vec3SGrid::Ptr wind = Vec3SGrid::create(Vec3s(0));
+        wind->setName("wind");
+        wind->tree().setValue({1, 1, 1}, Vec3s(3, 2, 1));
+        smoke->fill(CoordBBox({0, 0, 0}, {7, 7, 7}), 1.0f);
+        for (int i = 0; i < 8; ++i) temperature->tree().setValue({i, 0, 0}, 0.25f * i);
+        save("fire.vdb", {smoke, temperature, flames, wind});
+    }
+    // A cloud out of a weather model, with grids of a fire's names that give no light.
+    {
+        FloatGrid::Ptr cloud = fog("density"), temperature = fog("temperature"), ambient = fog("heat"), burn = fog("burn"), flames = fog("flames");
+        cloud->fill(CoordBBox({0, 0, 0}, {7, 7, 7}), 1.0f);
+        for (int i = 0; i < 8; ++i) temperature->tree().setValue({i, i, 0}, 250.0f + 5 * i);
+        ambient->fill(CoordBBox({0, 0, 0}, {7, 7, 7}), 1.0f);
+        burn->fill(CoordBBox({0, 0, 0}, {7, 7, 7}), 0.0f);
+        save("weather.vdb", {cloud, temperature, ambient, burn, flames});
+    }
     // A grid type that only a program which registers it can read.
     {
         using Odd = tree::Tree4<float, 5, 4, 2>::Type;
