@@ -17,7 +17,10 @@ _PEERS = {"octaves": ("#3d8a5f", "v"), "volpath": ("#444444", "s"), "oidn": ("#2
 
 
 def write_plots(folder: Path, rows: Sequence[Row]) -> int:
-    """Write `bench_<scene>.png`, time against error; returns how many, 0 without matplotlib."""
+    """Write `bench_<scene>.png`, time against error; returns how many, 0 without matplotlib.
+
+    An image whose error cannot be told from 0 is a hollow mark at the upper end of its interval.
+    """
     if find_spec("matplotlib") is None:
         return 0
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -37,9 +40,20 @@ def write_plots(folder: Path, rows: Sequence[Row]) -> int:
         FigureCanvasAgg(figure)
         axis = figure.subplots()
         for method, model, colour, marker, line in styles:
-            points = sorted(
-                (r for r in rows if (r.scene, r.method, r.model) == (scene, method, model) and r.report.rrmse > 0),
-                key=lambda r: r.seconds_warm,
+            size = 9 if marker == "*" else 5
+            mine = sorted((r for r in rows if (r.scene, r.method, r.model) == (scene, method, model)), key=lambda r: r.seconds_warm)
+            points = [r for r in mine if r.report.rrmse > 0]
+            # No logarithm of 0: what cannot be told from it is shown hollow, where its interval ends.
+            exact = [r for r in mine if r.report.rrmse == 0 and r.report.rrmse_interval[1] > 0]
+            axis.plot(
+                [r.seconds_warm for r in exact],
+                [100 * r.report.rrmse_interval[1] for r in exact],
+                color=colour,
+                marker=marker,
+                ms=size,
+                ls="",
+                fillstyle="none",
+                label=None if points or not exact else label(method, model),
             )
             if not points:
                 continue
@@ -50,7 +64,6 @@ def write_plots(folder: Path, rows: Sequence[Row]) -> int:
             ]
             bars = [[max(0.0, b) for b in side] for side in bars]
             seconds = [p.seconds_warm for p in points]
-            size = 9 if marker == "*" else 5
             axis.errorbar(
                 seconds, errors, bars, color=colour, marker=marker, ms=size, ls=line, capsize=2, lw=1.2, label=label(method, model)
             )
