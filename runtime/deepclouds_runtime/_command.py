@@ -171,6 +171,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     volume.add_argument("--size", type=_size, metavar="WxH", help="pixels (default 640x480)")
     volume.add_argument("--grid", metavar="NAME", help="grid in a .vdb file")
     volume.add_argument("--clamp", action="store_true", help="set negative values and NaN in the file to 0")
+    volume.add_argument("--ignore-emission", action="store_true", help="render what a fire scatters, without the light that it gives off")
     return parser
 
 
@@ -186,6 +187,8 @@ def run(argv: Sequence[str], prog: str) -> int:
     options: dict[str, Any] = {k: getattr(arguments, k) for k in (*_VOLUME, *_BOTH, "sensor", "grid") if getattr(arguments, k) is not None}
     if arguments.clamp:
         options["clamp"] = True
+    if arguments.ignore_emission:
+        options["ignore_emission"] = True
     how: dict[str, Any] = {"mode": arguments.mode, "multiple": arguments.multiple, "interreflection": not arguments.no_interreflection}
     if arguments.extrapolate:
         how["extrapolate"] = True

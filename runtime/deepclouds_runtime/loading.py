@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,8 @@ from deepclouds_runtime.renderer import Renderer
 from deepclouds_runtime.scattering import Predicts
 from deepclouds_runtime.scene import CloudScene, read_scene
 from deepclouds_runtime.volume_scene import options_from, volume_scene
+
+_LOG = logging.getLogger(__name__)
 
 # How a render is done, whatever the input.
 RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection", "extrapolate", "unit")
@@ -32,6 +36,7 @@ def load(
     threads: int | None = None,
     grid: str | None = None,
     clamp: bool = False,
+    ignore_emission: bool = False,
     fixed: Fixed | None = None,
     turn: int = 1,
     **options: Any,
@@ -52,6 +57,8 @@ def load(
         threads for everything; None takes all cores.
     grid, clamp
         name of the grid in a .vdb file; set negative values and NaN to 0.
+    ignore_emission
+        render what the cloud scatters where a .vdb file says that it gives off light of its own, in place of refusing it.
     fixed
         what stays the same over the sequence that a volume belongs to, see `deepclouds_runtime.key_frames`.
     turn
@@ -84,7 +91,7 @@ def load(
     mitsuba(select=is_path)
     if threads is not None:
         _set_threads(threads)
-    scene = _scene(source, path, dict(defines or {}), grid, clamp, fixed, turn, options)
+    scene = _scene(source, path, dict(defines or {}), grid, clamp, ignore_emission, fixed, turn, options)
     if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
         from deepclouds.volume.pyramid import optical_size
         from deepclouds_runtime.predictor import predictor_for
@@ -112,6 +119,7 @@ def _scene(
     defines: dict[str, str],
     grid: str | None,
     clamp: bool,
+    ignore_emission: bool,
     fixed: Fixed | None,
     turn: int,
     options: dict[str, Any],
@@ -120,17 +128,42 @@ def _scene(
         if defines:
             raise InputError(f"{path}: -D{next(iter(defines))} has no meaning for a volume; it sets a parameter of a scene file")
         wanted = options_from(options)
+        volume = read_volume(path, grid, clamp)
+        notes = _emission(path, grid, ignore_emission)
         if fixed is None:
-            return volume_scene(read_volume(path, grid, clamp), wanted, str(path), turn=turn)
-        return volume_scene(read_volume(path, grid, clamp), with_extinction(wanted, fixed), str(path), fixed.corners, turn)
+            scene = volume_scene(volume, wanted, str(path), turn=turn)
+        else:
+            scene = volume_scene(volume, with_extinction(wanted, fixed), str(path), fixed.corners, turn)
+        return replace(scene, notes=scene.notes + notes)
     if path is not None and path.suffix.lower() != ".xml":
         raise InputError(f"{path}: deepclouds renders Mitsuba scenes (.xml) and volumes (.vdb, .vol), not '{path.suffix}'")
     unknown = sorted(set(options) - set(SCENE_OPTIONS))
     if unknown:
         raise InputError(f"{path or 'the scene'}: the option '{unknown[0]}' belongs to a volume; a scene says it itself")
-    if grid is not None or clamp:
-        raise InputError(f"{path or 'the scene'}: grid and clamp belong to a volume; a scene says itself what it reads")
+    if grid is not None or clamp or ignore_emission:
+        raise InputError(f"{path or 'the scene'}: grid, clamp and ignore_emission belong to a volume; a scene says itself what it reads")
     return read_scene(source if path is None else load_xml(path, defines), **options)
+
+
+def _emission(path: Path, grid: str | None, ignore: bool) -> tuple[str, ...]:
+    """Sentences about the light that a cloud gives off and we leave out; raises InputError for it unless we are told to `ignore` it."""
+    if path.suffix.lower() != ".vdb":
+        return ()
+    # Loads the native module, so only here.
+    from deepclouds.volume.emission import emissive_grids
+
+    found = emissive_grids(path, grid)
+    if not found:
+        return ()
+    named = f"grid{'s' if len(found) > 1 else ''} {', '.join(repr(name) for name in found)}"
+    if not ignore:
+        raise InputError(
+            f"{path}: by its {named} the cloud gives off light of its own, which deepclouds does not render; "
+            "ignore_emission (--ignore-emission) renders what it scatters alone"
+        )
+    note = f"light that the cloud gives off by its {named} is left out"
+    _LOG.info("%s: %s", path, note)
+    return (note,)
 
 
 def load_xml(path: Path, defines: dict[str, str]) -> Any:

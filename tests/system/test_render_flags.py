@@ -48,6 +48,7 @@ KEEPING = {
     "--quiet": [],
     "--grid": ["density"],
     "--clamp": [],
+    "--ignore-emission": [],
     "--no-interreflection": [],
     "--png": ["{folder}/other.png"],
     "--exposure": ["1"],
