@@ -73,8 +73,8 @@ def glows(name: str, values: NDArray[np.float32], background: float = 0.0) -> bo
 
     Notes
     -----
-    Flames are light wherever they are not 0. A temperature is none where it is the same in the whole box, however warm, nor where it is given in
-    Kelvin and stays below `GLOW`: values other than 0 that all lie above 100 are taken for Kelvin.
+    Flames are light wherever they are not 0. A temperature is none where it is the same in the whole box, however warm, nor where it is
+    given in Kelvin and stays below `GLOW`: values other than 0 that all lie above 100 are taken for Kelvin.
     """
     if _LIGHT.search(_words(name)) is not None:
         return background != 0 or bool(np.any(values != 0))
