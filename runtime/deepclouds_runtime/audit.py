@@ -150,7 +150,9 @@ class Audit:
         assert self._sums is not None
         if not correction.levels:
             return list(self._sources)
-        return [source.corrected(correction, self._sums.floor / len(self._sources)) for source in self._sources]
+        points, weights, *_ = (np.concatenate(parts) for parts in zip(*self._looked_at, strict=True))
+        floor = self._sums.floor / len(self._sources)
+        return [source.corrected(correction, floor, points, weights) for source in self._sources]
 
     def _judged(self, steps: list[Array] | None) -> RegionError:
         """Error of what is audited; or with a change (channels, regions) for each half that does not depend on that half's walks."""

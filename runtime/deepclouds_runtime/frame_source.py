@@ -68,8 +68,8 @@ class FrameSource:
     doubt: DeviceOctree | None = None
     built: Octree | None = None
 
-    def corrected(self, correction: Callable[[Array], Array], floor: Array) -> FrameSource:
-        """J + (J + floor) d in the place of J at the nodes, with d = correction(world points); nowhere below 0.
+    def corrected(self, correction: Callable[[Array], Array], floor: Array, points: Array, weights: Array) -> FrameSource:
+        """J + (J + floor) d in the place of J, with d = correction(world points), as well as the nodes can have it; nowhere below 0.
 
         Parameters
         ----------
@@ -77,6 +77,8 @@ class FrameSource:
             d (n, channels), or (n, 1) for all channels.
         floor
             the same of each channel, (channels,) or (1,).
+        points, weights
+            world points (n, 3) that the camera sees, and how much each counts.
         """
         built = self.built
         if built is None:
@@ -92,7 +94,7 @@ class FrameSource:
             changed: Array = np.maximum(values + (values + of_field) * asked, 0)
             return changed
 
-        return replace(self, octree=built.changed(self.octree.types, change))
+        return replace(self, octree=built.changed(self.octree.types, change, points, weights))
 
     def summary(self) -> dict[str, Any]:
         """What it took, for a report."""

@@ -27,6 +27,8 @@ _MOST_CELLS_A_SIDE = 64
 _GAIN = 3.0
 # Error that is taken for that of root cells, of which nothing is known, over the mean value.
 _UNMEASURED = 0.15
+# Times that values at the nodes are drawn to what is wanted between them.
+_SWEEPS = 8
 # New corners of a cell that is split: neighbours share most of the 19 that all of its children have.
 _NODES_A_SPLIT = 7
 
@@ -262,12 +264,52 @@ class Octree:
         leaves = self._leaves[..., self.fields :] if carried else self._leaves[..., : self.fields]
         return DeviceOctree(types, self.lattice, self._table, leaves)
 
-    def changed(self, types: Any, change: Callable[[Array, Array], Array]) -> DeviceOctree:
-        """The same on the device with other values: `change` maps world points (n, 3) and values (n, fields) there to values."""
-        local = (self._corners[:, None] + self._edges[:, None, None] * _CORNERS).reshape(-1, 3)
+    def changed(self, types: Any, change: Callable[[Array, Array], Array], points: Array, weights: Array) -> DeviceOctree:
+        """The same on the device with other values, none below 0.
+
+        A change may vary more quickly than the nodes are close: taken at the nodes alone it would be another one between them. So what is
+        interpolated is fitted to the change at `points`, which the nodes have around them; nodes without any take the change itself.
+
+        Parameters
+        ----------
+        types
+            Dr.Jit types.
+        change
+            world points (n, 3) and the values (n, fields) there -> other values.
+        points, weights
+            world points (n, 3) where the values are asked for, and how much each counts.
+        """
         leaves = self._leaves[..., : self.fields]
-        values = change(self.lattice.world(local), leaves.reshape(-1, self.fields))
-        return DeviceOctree(types, self.lattice, self._table, values.astype(np.float32).reshape(leaves.shape))
+        local = (self._corners[:, None] + self._edges[:, None, None] * _CORNERS).reshape(-1, 3)
+        keys = np.rint(local * 2.0**self._levels).astype(np.int64) @ (1, 1 << _BITS, 1 << 2 * _BITS)
+        _, first, node = np.unique(keys, return_index=True, return_inverse=True)
+        node = node.reshape(leaves.shape[:2])
+        values = change(self.lattice.world(local[first]), leaves.reshape(-1, self.fields)[first])
+        leaf, tent = self._located(points)
+        wanted = change(points, np.einsum("nc,nck->nk", tent, leaves[leaf]))
+        around, share = node[leaf], tent * weights[:, None]
+        below = np.bincount(around.ravel(), share.ravel(), len(first))
+        near = below > 0
+        for _ in range(_SWEEPS):
+            left = wanted - np.einsum("nc,nck->nk", tent, values[around])
+            for k in range(self.fields):
+                step = np.bincount(around.ravel(), (share * left[:, k : k + 1]).ravel(), len(first))
+                values[near, k] += step[near] / below[near]
+            np.maximum(values, 0, out=values)
+        return DeviceOctree(types, self.lattice, self._table, values.astype(np.float32)[node])
+
+    def _located(self, points: Array) -> tuple[Array, Array]:
+        """The leaf (n,) that holds each world point (n, 3), and the weights (n, 8) of its corners."""
+        size = self.lattice.size
+        local = self.lattice.local(points)
+        root = np.clip(np.floor(local), 0, size - 1)
+        place = np.clip(local - root, 0, 1)
+        leaf: Array = self._table[root.astype(np.int64) @ (1, int(size[0]), int(size[0] * size[1]))].astype(np.int64)
+        while len(inner := np.flatnonzero(leaf < 0)):
+            octant = (place[inner] >= 0.5).astype(np.int64)
+            place[inner] = 2 * place[inner] - octant
+            leaf[inner] = self._table[octant @ (1, 2, 4) - leaf[inner]]
+        return leaf, _trilinear(place)
 
 
 class DeviceOctree:

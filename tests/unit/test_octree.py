@@ -99,6 +99,41 @@ def test_the_budget_bounds_the_nodes() -> None:
     assert bounded < 1500
 
 
+def test_a_change_between_the_nodes_arrives_there() -> None:
+    """A change that vanishes at all nodes, where it would be lost, is met on the mean and in part in place; no value falls below 0."""
+    points, tried = _points(20000, 7), _points(20000, 8)
+
+    def flat(where: NDArray[np.float64]) -> NDArray[np.float32]:
+        return np.ones((len(where), 1), np.float32)
+
+    octree = Octree(_lattice(0.25), flat, points, np.ones(len(points)), 0.01, 10**6, 2)
+    place = octree.lattice
+
+    def waves(where: NDArray[np.float64], values: NDArray[np.float32]) -> NDArray[np.float64]:
+        local = place.local(where)
+        slow = np.sin(0.7 * local[:, :1])
+        result: NDArray[np.float64] = values + (0.6 + 0.4 * slow) * np.sin(np.pi * local[:, 1:2]) ** 2
+        return result
+
+    device = octree.changed(types, waves, points, np.ones(len(points)))
+    found = np.array(device.lookup(device.to_local(_upload(tried)), types.Bool(True))[0], np.float64)[:, None]
+    wanted = waves(tried, flat(tried))
+    assert found.mean() == pytest.approx(wanted.mean(), rel=2e-3)
+    slow = np.sin(0.7 * place.local(tried)[:, 0])
+    assert np.cov(found[:, 0], slow)[0, 1] == pytest.approx(np.cov(wanted[:, 0], slow)[0, 1], rel=0.05)
+    device = octree.changed(types, lambda where, values: waves(where, values) - 1.3, points, np.ones(len(points)))
+    assert min(float(np.array(v).min()) for v in device.lookup(device.to_local(_upload(tried)), types.Bool(True))) >= 0
+
+
+def test_a_linear_change_is_met_exactly_where_cells_of_two_sizes_meet() -> None:
+    points, tried = _points(8000, 5), _points(2000, 6)
+    octree = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), 0.02, 10**6, 4)
+    before = _lookup(octree, tried)
+    device = octree.changed(types, lambda where, values: values * 1.7, points, np.ones(len(points)))
+    found = np.array([np.array(v) for v in device.lookup(device.to_local(_upload(tried)), types.Bool(True))], np.float64).T
+    np.testing.assert_allclose(found, 1.7 * before, rtol=2e-4)
+
+
 def _ball() -> tuple[Field, NDArray[np.float64], NDArray[np.float64]]:
     c = (np.arange(12) + 0.5) / 6 - 1
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
