@@ -35,6 +35,7 @@ from deepclouds.replacing import replacing
 ROOT = Path(__file__).resolve().parents[1]
 _TITLES = {
     "scene": "Scenes",
+    "corrected": "Scenes, corrected by audit walks",
     "furnace": "White furnace",
     "slabs": "Slabs",
     "labels": "Held-out labels",
@@ -87,6 +88,7 @@ class Results:
         """All figures."""
         return [
             *(s.row for s in self.scenes),
+            *(s.corrected for s in self.scenes),
             *furnace_rows(self.furnace),
             *slab_rows(self.slabs),
             *(row for result in self.labels for row in result.rows),
@@ -158,6 +160,7 @@ def measure(folders: Sequence[Path], predictor: Predictor, size: Size, labels: S
     for folder in folders:
         results.scenes.append(measure_scene(folder, predictor, size.spp))
         say(results.scenes[-1].row.line)
+        say(results.scenes[-1].corrected.line)
     results.furnace.extend(measure_furnace(predictor, size.clouds, size.furnace_spp, say))
     for slab in accuracy_slabs.cases()[:: size.every]:
         results.slabs.append(measure_slab(slab, predictor))

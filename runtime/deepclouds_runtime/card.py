@@ -20,6 +20,7 @@ from deepclouds.replacing import replacing
 
 _PARTS = {
     "scene": "Images of scenes against path-traced references",
+    "corrected": "The same, corrected by audit walks as `deepclouds render` does by default",
     "furnace": "White furnace: deviation from 1",
     "slabs": "Flux of plane-parallel slabs against the discrete-ordinate method",
     "labels": "Held-out labels",

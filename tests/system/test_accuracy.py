@@ -200,7 +200,7 @@ def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixt
     assert {p.name for p in tmp_path.glob("*.png")} == {f"accuracy_{name}.png" for name in pictures}
     kept = json.loads((tmp_path / "accuracy.json").read_text())
     assert kept["headline"] == lines[-1]
-    assert {row["part"] for row in kept["rows"]} == {"scene", "furnace", "slabs", "labels", "special", "confidence"}
+    assert {row["part"] for row in kept["rows"]} == {"scene", "corrected", "furnace", "slabs", "labels", "special", "confidence"}
 
 
 def test_bad_input_is_refused(tmp_path: Path) -> None:
