@@ -164,6 +164,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--sun", type=_numbers((2,)), metavar=_PAIR, help="where the sun stands, degrees; azimuth 0 is +Z and grows to +X (default 100,35)"
     )
     volume.add_argument("--irradiance", type=_numbers((1, 3)), metavar="E|R,G,B", help="of the sun, perpendicular to it (default 12)")
+    volume.add_argument("--sun-diameter", metavar="DEG", type=float, help="of the sun's disc, an angle (default 0; the real one has 0.53)")
     volume.add_argument("--env", metavar="FILE", help="environment map for light and background, in place of sun and sky")
     volume.add_argument("--sky", type=_numbers((1, 3)), metavar="L|R,G,B", help="radiance of the uniform sky (default 0.09,0.17,0.34)")
     volume.add_argument("--up", choices=("y", "z"), help="axis that points up; with z, azimuth 0 is +X and grows to +Y (default y)")
@@ -175,7 +176,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     return parser
 
 
-_VOLUME = ("optical_depth", "extinction", "albedo", "g", "phase", "sun", "irradiance", "env", "sky", "up", "view", "size")
+_VOLUME = ("optical_depth", "extinction", "albedo", "g", "phase", "sun", "irradiance", "sun_diameter", "env", "sky", "up", "view", "size")
 _BOTH = ("max_depth", "hide_emitters")
 _MAY_BE_NEGATIVE = ("--phase", "--sun", "--view", "--albedo", "--irradiance", "--sky", "--size")
 

@@ -23,9 +23,10 @@ from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import confidence, doubtful, relative_errors, warning
+from deepclouds_runtime.disc import background
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
-from deepclouds_runtime.lights import Environment, Shade, environment, mitsuba_radiance
+from deepclouds_runtime.lights import Environment, Shade, environment
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, WalkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
@@ -665,10 +666,11 @@ class _Work:
             self._collect(where, "surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)
             alpha = alpha + dr.select(shown, through, 0)
-        if scene.backdrop is not None and not scene.hide_emitters:
-            sky = mitsuba_radiance(types, scene.backdrop)(direction)
+        look = None if scene.hide_emitters else background(types, scene.backdrop, scene.suns)
+        if look is not None:
+            sky, shines = look(direction)
             self._collect(where, "background", [value * behind for value in sky])
-            alpha = alpha + behind
+            alpha = alpha + dr.select(shines, behind, 0)
         self._collect(where, "A", [alpha])
         self.spent("surfaces and background", clock)
 

@@ -36,7 +36,7 @@ class CloudScene:
     phase
         phase function (g1, g2, weight), see `deepclouds.medium.phase`.
     suns
-        directional lights.
+        distant lights, points and discs.
     environment
         Mitsuba's `envmap`, `constant` or (without its sun) `sunsky` emitter that lights the scene, or None.
     surfaces
@@ -102,7 +102,6 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     media = [read_medium(container) for container in containers]
     medium = media[0] if len(media) == 1 else merged(media, notes)
     lights = read_lights(scene.emitters())
-    notes.extend(lights.notes)
     integrator = scene.integrator()
     if max_depth is None:
         max_depth = _integrator_depth(integrator)

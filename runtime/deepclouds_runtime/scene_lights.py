@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -18,27 +19,43 @@ _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 
 @dataclass(frozen=True)
 class Sun:
-    """A distant light: unit vector `omega_sun` TOWARD it and its irradiance perpendicular to it, one value a colour channel."""
+    """A distant light.
+
+    Parameters
+    ----------
+    omega_sun
+        unit vector TOWARD it, of a disc toward the middle.
+    irradiance
+        perpendicular to `omega_sun`, one value a colour channel.
+    radius
+        of its disc as an angle, radians; 0 for a point.
+    limb
+        radiance of a disc over its mean, a row for each of its rings of equal solid angle from the middle out, a value a colour channel; a
+        disc without rows is even.
+    shown
+        whether the camera sees its disc beside the backdrop.
+    """
 
     omega_sun: tuple[float, float, float]
     irradiance: tuple[float, ...]
+    radius: float = 0.0
+    limb: tuple[tuple[float, ...], ...] = ()
+    shown: bool = False
 
 
 @dataclass(frozen=True)
 class SceneLights:
-    """The lights of a scene: suns, the environment without them, the emitter that the camera sees, and what was approximated."""
+    """The lights of a scene: suns, the environment without them, and the emitter that the camera sees."""
 
     suns: tuple[Sun, ...]
     environment: Any
     backdrop: Any
-    notes: tuple[str, ...]
 
 
 def read_lights(emitters: Iterable[Any]) -> SceneLights:
     """Tell the Mitsuba emitters of a scene apart; raises InputError for lights of other kinds."""
     mi = mitsuba()
     suns: list[Sun] = []
-    notes: list[str] = []
     environment = backdrop = None
     for emitter in emitters:
         kind = emitter.class_name()
@@ -50,10 +67,9 @@ def read_lights(emitters: Iterable[Any]) -> SceneLights:
             parts = split(emitter)
             environment, backdrop = parts.sky, emitter
             if max(parts.irradiance) > 0:
-                suns.append(Sun(parts.omega_sun, parts.irradiance))
-                notes.append(f"the sunsky's disc of {parts.aperture:.3g} degrees lights from its middle: shadows have no penumbra")
+                suns.append(Sun(parts.omega_sun, parts.irradiance, math.radians(parts.aperture / 2), parts.limb))
         elif kind in _ENVIRONMENTS:
             environment = backdrop = emitter
         else:
             raise InputError(f"emitter '{emitter.id()}' ({kind}): the lights we know are {LIGHT_NAMES}")
-    return SceneLights(tuple(suns), environment, backdrop, tuple(notes))
+    return SceneLights(tuple(suns), environment, backdrop)

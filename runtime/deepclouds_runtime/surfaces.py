@@ -14,7 +14,8 @@ from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.medium.phase import rotate_to
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
-from deepclouds_runtime.lights import Beam, Environment, directions_of_cells, on_host
+from deepclouds_runtime.disc import Disc, discs
+from deepclouds_runtime.lights import Beam, Environment, LightSource, directions_of_cells, on_host
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
@@ -57,12 +58,15 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
         return channels(types, bsdf.eval(context, interaction, interaction.to_local(mi.Vector3f(omega)), valid))
 
     for sun in lights.suns:
+        if sun.radius > 0:
+            continue
         omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
         share, origin = through(omega)
         share = dr.select(lights.shade.visible(origin, omega), share, 0)
         for c, value in enumerate(facing(omega)):
             total[c] += value * share * dr.opaque(types.Float, sun.irradiance[c])
-    for source, _ in lights.sources:
+    wide: list[LightSource | Disc] = [source for source, _ in lights.sources]
+    for source in wide + discs(types, lights.suns, lights.shade):
         omega, density = source.sample(numbers.number(stratified.LIGHT_U), numbers.number(stratified.LIGHT_V))
         other = plain(types, bsdf.pdf(context, interaction, interaction.to_local(mi.Vector3f(omega)), valid))
         share, origin = through(omega)

@@ -21,6 +21,7 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import TAU_OPAQUE, distance_at, optical_depth
 from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
 from deepclouds_runtime import stratified
+from deepclouds_runtime.disc import discs
 from deepclouds_runtime.lights import LightSource, Shade
 from deepclouds_runtime.scattering import MultipleScattering
 from deepclouds_runtime.scene_lights import Sun
@@ -74,7 +75,7 @@ class Lights:
     Parameters
     ----------
     suns
-        directional lights.
+        distant lights, points and discs.
     sources
         pairs of a light from many directions and how many of them a sample draws.
     shade
@@ -243,7 +244,13 @@ def single_scattering(
             dr.eval(tau, direct, radiance)
             each(omega, radiance, tau)
 
+    for disc in discs(types, lights.suns, lights.shade):
+        # A disc is small: directions drawn from it alone do where the phase function's peak is no narrower.
+        omega, density = disc.sample(numbers.number(stratified.LIGHT_U), numbers.number(stratified.LIGHT_V))
+        light(omega, [value / density for value in disc.arriving(points, omega, numbers)], 1)
     for sun in lights.suns:
+        if sun.radius > 0:
+            continue
         omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
         seen = lights.shade.visible(points, omega)
         light(omega, [dr.select(seen, dr.opaque(types.Float, e), 0) for e in sun.irradiance], 1)

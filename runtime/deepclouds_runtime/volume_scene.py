@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,10 @@ _LARGEST = 1e15
 _DEFAULT_OPTICAL_DEPTH = 60.0
 _DEFAULT_G = 0.85
 _DEFAULT_SUN = (100.0, 35.0)
+# Wider, a sun is a sky.
+_WIDEST_SUN = 90.0
+# Distance of the disc that stands for it in Mitsuba, over the size of the cloud, and the end of what the camera sees, in distances.
+_FAR_DISC, _FAR_CLIP = 1e4, 1e5
 # Thinner voxels do not push the camera away: a haze around a cloud is no part of the picture's subject.
 _FRAMED = 0.01
 
@@ -48,6 +53,8 @@ class VolumeOptions:
         toward +Y. By default (100, 35), or no sun when `env` is given.
     irradiance
         of the sun, perpendicular to it: one value or three.
+    sun_diameter
+        of the sun's disc as an angle; 0 for a sun without a size, 0.53 for the real one. The camera sees the disc.
     env
         an environment map (latitude-longitude, .exr or .hdr) that lights the cloud and stands behind it.
     sky
@@ -73,6 +80,7 @@ class VolumeOptions:
     phase: tuple[float, float, float] | None = None
     sun: tuple[float, float] | None = None
     irradiance: tuple[float, ...] = (12.0,)
+    sun_diameter: float = 0.0
     env: str | None = None
     sky: tuple[float, ...] = (0.09, 0.17, 0.34)
     up: str = "y"
@@ -123,12 +131,13 @@ def volume_scene(
     lights = read_lights(parts.values())
     channels = len(mi.Spectrum())
     albedo = _three(options.albedo) if channels == 3 else (float(np.dot(_three(options.albedo), (0.2126, 0.7152, 0.0722))),)
+    radius = math.radians(options.sun_diameter / 2)
     return CloudScene(
         volume,
         scale,
         albedo,
         lobes(options),
-        lights.suns,
+        tuple(dataclasses.replace(sun, radius=radius, shown=radius > 0) for sun in lights.suns),
         lights.environment,
         None,
         camera,
@@ -176,8 +185,11 @@ def cloud_description(volume: Volume, options: VolumeOptions, source: str) -> di
         "phase": _phase_description(lobes(options)),
     }
     container = {"type": "cube", "to_world": unit @ to_cube, "bsdf": {"type": "null"}, "interior": medium}
+    scene = description(volume, options)
+    if options.sun_diameter > 0 and "sun" in scene:
+        scene["sun"] = _far_disc(volume, options)
     return {
-        **description(volume, options),
+        **scene,
         "cloud": container,
         "integrator": {
             "type": "volpath",
@@ -185,6 +197,29 @@ def cloud_description(volume: Volume, options: VolumeOptions, source: str) -> di
             "rr_depth": 1_000_000,
             "hide_emitters": options.hide_emitters,
         },
+    }
+
+
+def _far_disc(volume: Volume, options: VolumeOptions) -> dict[str, Any]:
+    """The disc of the sun as an area light so far away that it lies in one direction: Mitsuba has no disc at infinity."""
+    import mitsuba as mi
+
+    sun = _DEFAULT_SUN if options.sun is None else options.sun
+    corners = framed_corners(volume)
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    distance = _FAR_DISC * float(np.ptp(corners, axis=0).max())
+    radius = math.radians(options.sun_diameter / 2)
+    toward = _direction(sun, options.up)
+    radiance = [value / (math.pi * math.sin(radius) ** 2) for value in _three(options.irradiance)]
+    look = mi.ScalarTransform4f().look_at(
+        origin=(middle + distance * toward).tolist(),
+        target=middle.tolist(),
+        up=_axes(options.up)[int(abs(toward @ _axes(options.up)[2]) < 0.9) * 2].tolist(),
+    )
+    return {
+        "type": "disk",
+        "to_world": look @ mi.ScalarTransform4f().scale(distance * math.tan(radius)),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
     }
 
 
@@ -227,6 +262,8 @@ def _check(options: VolumeOptions) -> None:
         refuse("phase", "give g1 and g2 between -1 and 1, both excluded, and a weight of the first in 0 to 1")
     if options.up not in ("y", "z"):
         refuse("up", "choose 'y' or 'z'")
+    if not 0 <= options.sun_diameter <= _WIDEST_SUN:
+        refuse("sun_diameter", f"give an angle of 0 to {_WIDEST_SUN:g} degrees; the real sun has 0.53")
     for name in ("optical_depth", "extinction"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value >= 0):
@@ -334,7 +371,7 @@ def _camera(corners: NDArray[np.float64], options: VolumeOptions, turn: int) -> 
         "fov": _FOV,
         "fov_axis": "larger",
         "near_clip": 1e-4 * distance,
-        "far_clip": 1e3 * distance,
+        "far_clip": _FAR_CLIP * distance,
         "to_world": mi.ScalarTransform4f().look_at(
             origin=(middle - basis[2] * distance).tolist(), target=middle.tolist(), up=basis[1].tolist()
         ),
@@ -372,8 +409,9 @@ def options_from(given: dict[str, Any]) -> VolumeOptions:
     if "env" in given:
         if "sky" in given:
             raise InputError("env and sky are both given: the map is the sky; leave one out")
-        if "irradiance" in given and "sun" not in given:
-            raise InputError(f"irradiance = {given['irradiance']}: with an environment map there is no sun unless sun says where; add it")
+        for name in ("irradiance", "sun_diameter"):
+            if name in given and "sun" not in given:
+                raise InputError(f"{name} = {given[name]}: with an environment map there is no sun unless sun says where; add it")
     values = dict(given)
     for name in ("albedo", "irradiance", "sky"):
         if name in values:

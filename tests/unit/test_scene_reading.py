@@ -157,10 +157,10 @@ def test_a_scene_under_a_sunsky(mi: Any, folder: Path) -> None:
     assert len(read.suns) == 1
     np.testing.assert_allclose(read.suns[0].omega_sun, np.array([0.3, 0.2, 0.9]) / np.linalg.norm([0.3, 0.2, 0.9]), atol=1e-6)
     assert read.backdrop is not read.environment
-    assert "0.536 degrees" in read.notes[0]
+    assert read.suns[0].radius == pytest.approx(np.deg2rad(0.5358 / 2), rel=1e-3)
+    assert not read.suns[0].shown
     without = read_scene(load(mi, folder, cloud() + light.format(0)))
     assert not without.suns
-    assert not without.notes
 
 
 def test_homogeneous_media(mi: Any, folder: Path) -> None:
