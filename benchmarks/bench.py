@@ -219,7 +219,7 @@ def machine() -> str:
 def light_of(scene: Path) -> str:
     """What lights a scene file: "environment", or "sun" where there is none."""
     kinds = {emitter.get("type") for emitter in ElementTree.parse(scene).getroot().iter("emitter")}
-    return "environment" if kinds & {"envmap", "constant"} else "sun"
+    return "environment" if kinds & {"envmap", "constant", "sunsky"} else "sun"
 
 
 def write_docs(rows: Sequence[Row], table: str, docs: Path = ROOT / "docs") -> None:
