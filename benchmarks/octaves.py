@@ -19,7 +19,8 @@ import numpy as np
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain, types_of
 from deepclouds_runtime.camera import Camera
-from deepclouds_runtime.lights import Shade, environment, mitsuba_radiance
+from deepclouds_runtime.disc import background
+from deepclouds_runtime.lights import Shade, environment
 from deepclouds_runtime.march import depths
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
@@ -128,8 +129,9 @@ class OctaveRenderer:
         colours, through = self._cloud_light(lights, origin, direction, end, numbers)
         if interaction is not None:
             colours = [a + b * through for a, b in zip(colours, reflected(self._cloud, lights, interaction, numbers), strict=True)]
-        if scene.backdrop is not None and not scene.hide_emitters:
-            sky = mitsuba_radiance(types, scene.backdrop)(direction)
+        look = None if scene.hide_emitters else background(types, scene.backdrop, scene.suns)
+        if look is not None:
+            sky, _ = look(direction)
             colours = [a + dr.select(shown, 0, b * through) for a, b in zip(colours, sky, strict=True)]
         dr.eval(colours)
         return colours
