@@ -7,6 +7,10 @@ import importlib
 import os
 from functools import cache
 from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
 
@@ -46,3 +50,16 @@ def backend(name: str = "llvm") -> ModuleType:
         )
         raise InputError(f"the Dr.Jit backend '{name}' is not available: {remedy}")
     return module
+
+
+def rows(vector: Any) -> NDArray[np.float32]:
+    """An Array3f as rows (n, 3) of a NumPy array.
+
+    It is taken over component by component: as a whole it would pass through a kernel in which n is a constant, and each new n would
+    compile one more.
+    """
+    import drjit as dr
+
+    dr.eval(vector)
+    result: NDArray[np.float32] = np.stack(np.broadcast_arrays(*(np.array(component) for component in vector)), axis=1)
+    return result

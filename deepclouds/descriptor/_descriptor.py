@@ -136,6 +136,8 @@ class Descriptor:
         place = dr.arange(types.UInt32, n * POINTS)
         interleave = place // 5
         interleave = interleave + (place - interleave * 5) * dr.opaque(types.UInt32, n * _ROWS)
+        # As `dr.concat` does it, in which the number of points would be a constant of the kernel, compiled anew for each number.
+        starts = [lane + dr.opaque(types.UInt32, i * n * _ROWS) for i in range(5)]
 
         def start(axes: list[Any], base: Any) -> tuple[Any, Any]:
             """Middle of the row, and the step from one of its points to the next."""
@@ -158,7 +160,10 @@ class Descriptor:
                 middle, step = start(frame_axes, dr.fma(frame_point, level.inverse_spacing, level.shift))
                 values = [level.lookup(types, dr.fma(step, i - 2.0, middle)) for i in range(5)]
             dr.eval(values)
-            result.append(dr.gather(types.Float, dr.concat(values), interleave))
+            joined = dr.empty(types.Float, n * POINTS)
+            for value, index in zip(values, starts, strict=True):
+                dr.scatter(joined, value, index)
+            result.append(dr.gather(types.Float, joined, interleave))
             dr.eval(result[-1])
         return result
 

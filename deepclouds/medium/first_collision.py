@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import rows
 from deepclouds.medium.field import Field
 
 
@@ -46,7 +47,7 @@ def first_collisions(
     distance, hit = _track(field, o, d, types.PCG32(n, initstate=key))
     points = dr.fma(d, dr.select(hit, distance, 0), o)
     dr.eval(points, hit)
-    return np.array(points).T.astype(np.float32, copy=False), np.array(hit)
+    return rows(points), np.array(hit)
 
 
 @dr.syntax

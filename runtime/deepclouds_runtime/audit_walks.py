@@ -10,6 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from deepclouds.backend import rows
 from deepclouds.medium.multiple_scattering import trace_walks
 from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds_runtime import stratified
@@ -97,7 +98,7 @@ class Walks:
         seen = seen_by(self._cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _DEPTHS)
         if not len(seen.points):
             return None
-        along = np.broadcast_to(np.array(direction).T, (rays, 3))
+        along = np.broadcast_to(rows(direction), (rays, 3))
         predicted = predicted_at(self._sources, seen.points)
         share = seen.weights / rays
         # Walks are noisier where J is larger; some must be left for where the network sees nothing.
@@ -156,7 +157,7 @@ class Walks:
                 light = source.arriving(x, omega, numbers)
                 dr.eval(light, omega, density)
                 likely: Array = np.maximum(np.broadcast_to(np.array(density, np.float64), n), 1e-30)
-                toward.append(np.broadcast_to(np.array(omega, np.float32).T, (n, 3)))
+                toward.append(np.broadcast_to(rows(omega), (n, 3)))
                 arriving.append(on_host(light, n) / (_BEAMS * likely[:, None]))
         return toward, arriving
 

@@ -16,6 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import rows
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds_runtime.lights import Beam, LightSource, Shade
@@ -144,7 +145,7 @@ def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, cou
     take = taker(types, lane)
     points = dr.fma(take(direction), distance, take(origin))
     weights = np.repeat(np.array(hidden, np.float64) / count, count)
-    return Seen(np.array(points).T.astype(np.float64), weights, np.repeat(np.array(lanes, np.int64), count))
+    return Seen(rows(points).astype(np.float64), weights, np.repeat(np.array(lanes, np.int64), count))
 
 
 @dataclass(frozen=True)
