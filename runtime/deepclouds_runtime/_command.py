@@ -110,6 +110,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--mode", choices=("fast", "reference"), default="fast", help="reference: every sample asks the network (default %(default)s)"
     )
+    parser.add_argument(
+        "--exact-orders", metavar="N", type=_positive, help="sample N orders of scattering before the network is asked (default 1)"
+    )
+    parser.add_argument(
+        "--unbiased", action="store_true", help="trace paths until --error, --time or --spp is reached; no network is loaded"
+    )
     parser.add_argument("--seed", type=_seed, default=0, help="of all random numbers (default %(default)s)")
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with deepclouds)")
     parser.add_argument(
@@ -126,7 +132,6 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument("--variant", metavar="NAME", help="Mitsuba's variant, such as cuda_ad_rgb (default llvm_ad_rgb)")
     parser.add_argument("--threads", type=_positive, help="threads to use (default: all cores)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--multiple", choices=("network", "walks"), default="network", help=argparse.SUPPRESS)
     parser.add_argument(
         "--progressive",
         metavar="SECONDS",
@@ -190,7 +195,11 @@ def run(argv: Sequence[str], prog: str) -> int:
         options["clamp"] = True
     if arguments.ignore_emission:
         options["ignore_emission"] = True
-    how: dict[str, Any] = {"mode": arguments.mode, "multiple": arguments.multiple, "interreflection": not arguments.no_interreflection}
+    how: dict[str, Any] = {"mode": arguments.mode, "interreflection": not arguments.no_interreflection}
+    if arguments.unbiased:
+        how["unbiased"] = True
+    if arguments.exact_orders is not None:
+        how["exact_orders"] = arguments.exact_orders
     if arguments.extrapolate:
         how["extrapolate"] = True
     if arguments.env_directions is not None:

@@ -86,7 +86,8 @@ def corrects(arguments: Namespace, made: Plan) -> bool:
     """Whether images are corrected: unless told, an image alone in the fast mode, as the correction's noise differs between frames."""
     if arguments.correct is not None:
         return bool(arguments.correct)
-    return arguments.mode == "fast" and not arguments.audit and made.sequence is None and made.turntable is None
+    interpolated = arguments.mode == "fast" and not arguments.unbiased and (arguments.exact_orders or 1) == 1
+    return interpolated and not arguments.audit and made.sequence is None and made.turntable is None
 
 
 def run(made: Plan, arguments: Namespace, load: Mapping[str, Any], record: Mapping[str, Any], say: Callable[[str], None]) -> int:

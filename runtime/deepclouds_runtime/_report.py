@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from deepclouds.memory import gib
+from deepclouds_runtime.error_parts import in_words
 
 if TYPE_CHECKING:
     from deepclouds_runtime.renderer import Renderer, RenderResult
@@ -30,15 +31,17 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
     """Say what a render took, as a table."""
     statistics = result.statistics
     rows = [("mode", statistics.mode), ("samples a pixel", f"up to {statistics.spp:,}, on average {statistics.mean_spp:.3g}")]
-    if statistics.noise is not None:
-        rows.append(("noise of a pixel, estimated", f"{100 * statistics.noise:.2g} %"))
+    rows += zip(("error: samples and interpolation", "error: network"), in_words(statistics.error), strict=True)
     if statistics.network:
         rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
     rows += list(_audit_rows(statistics.audit))
     for name, source in statistics.sources.items():
         took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
         rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
-    rows += [(name.replace("_", " "), f"{value:,}") for name, value in asdict(result.counts).items() if name != "skipped"]
+    counts = {name.replace("_", " "): count for name, count in asdict(result.counts).items() if name != "skipped"}
+    if statistics.mode == "path-traced":
+        counts["walks"] = counts.pop("queries")
+    rows += [(name, f"{value:,}") for name, value in counts.items()]
     rows += [(f"no query: {name}", f"{value:,}") for name, value in statistics.skipped.items()]
     rows += [(f"memory: {name}", gib(count)) for name, count in statistics.memory.items()]
     rows += [(f"time: {name}", f"{seconds:.2f} s") for name, seconds in result.seconds.items()]

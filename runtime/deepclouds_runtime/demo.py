@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "python -m deepclouds_ru
     parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with the package)")
     parser.add_argument("--reference", action="store_true", help="also render the scene with Mitsuba's volpath, which takes minutes")
     parser.add_argument("--reference-spp", type=int, default=64, help="samples a pixel of the reference (default %(default)s)")
-    parser.add_argument("--multiple", choices=("network", "walks"), default="network", help=argparse.SUPPRESS)
+    parser.add_argument("--unbiased", action="store_true", help="trace paths in place of asking the network")
     arguments = parser.parse_args(argv)
     try:
         if min(arguments.size, arguments.spp, arguments.reference_spp) < 1:
@@ -52,7 +52,7 @@ def _run(arguments: argparse.Namespace, say: Callable[[str], None]) -> None:
 
     size = (arguments.size, max(1, arguments.size * 3 // 4))
     say(f"{DATA.name}: a procedural cumulus under a sun and a blue sky, {size[0]} x {size[1]} pixels, {arguments.spp} samples each")
-    renderer = load(str(DATA), model=arguments.model, multiple=arguments.multiple, size=size, **_OPTIONS)
+    renderer = load(str(DATA), model=arguments.model, unbiased=arguments.unbiased, size=size, **_OPTIONS)
     loaded = time.perf_counter()
     result = renderer.render(arguments.spp, seed=1)
     image = arguments.out / "demo.exr"
@@ -61,7 +61,7 @@ def _run(arguments: argparse.Namespace, say: Callable[[str], None]) -> None:
         "spp": arguments.spp,
         "seed": 1,
         **_OPTIONS,
-        "multiple": arguments.multiple,
+        "unbiased": arguments.unbiased,
         "model_hash": renderer.model_hash,
     }
     save(result, image, settings, image.with_suffix(".png"))

@@ -1,4 +1,8 @@
-"""Light of the cloud along camera rays with multiple scattering already known: no network, two short marches and a few shadow rays."""
+"""Light of the cloud along camera rays: two short marches, a few shadow rays, and multiple scattering.
+
+Multiple scattering is known already, and summed along the ray without any query; or, where several orders are kept exact or all are
+path-traced, it is sampled at one collision of each ray.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from deepclouds_runtime import stratified
 from deepclouds_runtime.frame_source import FrameSource
 from deepclouds_runtime.march import depths, gathered
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.transport import Cloud, CloudLight, Counts, Lights, opacity_of, single_scattering, taker
+from deepclouds_runtime.transport import Cloud, CloudLight, Counts, Lights, opacity_of, scatter, scatter_on, single_scattering, taker
 
 
 def fast_cloud_light(
@@ -25,11 +29,12 @@ def fast_cloud_light(
     numbers: Stratified,
     counts: Counts,
     count: int,
+    sampled: bool = False,
 ) -> CloudLight:
     """Light that the cloud sends back along camera rays, and what it hides.
 
-    Multiple scattering is summed along the whole ray; single scattering is taken at `count` collisions, one in each equal share of what the
-    ray's cloud hides.
+    Multiple scattering of `sources` is summed along the whole ray; single scattering is taken at `count` collisions, one in each equal
+    share of what the ray's cloud hides.
 
     Parameters
     ----------
@@ -45,6 +50,8 @@ def fast_cloud_light(
         is updated.
     count
         collisions a ray.
+    sampled
+        whether the multiple scattering of the cloud's own `scattering`, past its `exact` orders, is sampled at one of these collisions.
     """
     types, medium = cloud.field.types, cloud.field
     n, channels = dr.width(origin, direction, end), len(cloud.albedo)
@@ -90,4 +97,17 @@ def fast_cloud_light(
         dr.eval(single)
         for c in range(channels):
             dr.scatter(result.direct[c], dr.block_sum(single[c], count) * hidden * (1 / count), lanes)
+        if sampled and cloud.scattering is not None:
+            n = len(filled)
+            many = dr.opaque(types.UInt32, count)
+            slot = dr.minimum(types.UInt32(own.number(stratified.PLACE) * types.Float(many)), many - 1)
+            place = dr.fma(d, dr.gather(types.Float, distance, dr.arange(types.UInt32, n) * many + slot), o)
+            dr.eval(place)
+            # Its single scattering is there already: all that is kept of it is what was scattered again.
+            again = CloudLight(hidden, hidden, hidden)
+            again.direct, again.indirect = ([dr.zeros(types.Float, n) for _ in range(channels)] for _ in range(2))
+            go_on = scatter_on if cloud.exact > 1 else scatter
+            go_on(cloud, lights, place, d, hidden, types.Float(1), own, counts, dr.arange(types.UInt32, n), again)
+            for c in range(channels):
+                dr.scatter_add(result.indirect[c], again.indirect[c], lanes)
     return result

@@ -10,7 +10,8 @@
 | interreflection | boolean | light that surfaces and cloud throw on each other, one reflection each (default true) |
 | mode | string | `fast` (default), or `reference`: every sample asks the network |
 | error | float | of the fast mode without a number of samples: noise of a pixel to aim at over the mean (default 0.02) |
-| multiple | string | `network` (default), or `walks`: Monte Carlo in place of the network, for tests and references |
+| exact_orders | integer | orders of scattering that are sampled before the network is asked (default 1) |
+| unbiased | boolean | trace paths in place of asking the network (default false) |
 | extrapolate | boolean | ask the network about media that it was not trained on, in place of walks there (default false) |
 
 The plugin exists in Python, after ``import deepclouds_runtime``, in the variants ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_rgb`` and
@@ -71,7 +72,8 @@ def _integrator_class(mi: Any) -> Any:
             self.interreflection = bool(properties.get("interreflection", True))
             self.mode = str(properties.get("mode", "fast"))
             self.error = float(properties.get("error", 0.02))
-            self.multiple = str(properties.get("multiple", "network"))
+            self.exact_orders = int(properties.get("exact_orders", 1))
+            self.unbiased = bool(properties.get("unbiased", False))
             self.extrapolate = bool(properties.get("extrapolate", False))
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
@@ -82,11 +84,12 @@ def _integrator_class(mi: Any) -> Any:
 
             started = time.perf_counter()
             read = read_scene(scene, sensor, self.max_depth, bool(self.hide_emitters))
-            needs_model = self.max_depth != 2 and self.multiple == "network"
+            needs_model = self.max_depth != 2 and not self.unbiased
             renderer = Renderer(
                 read,
                 _predictor(self.model, read.phase, read.albedo, optical_size(read.volume, read.scale)) if needs_model else None,
-                multiple=self.multiple,
+                unbiased=self.unbiased,
+                exact_orders=self.exact_orders,
                 environment_directions=self.environment_directions,
                 interreflection=self.interreflection,
                 mode=self.mode,
@@ -100,7 +103,7 @@ def _integrator_class(mi: Any) -> Any:
             return (
                 f"DeepCloudsIntegrator[\n  max_depth = {self.max_depth},\n  hide_emitters = {bool(self.hide_emitters)},\n"
                 f"  model = {self.model or 'default'},\n  environment_directions = {self.environment_directions},\n"
-                f"  interreflection = {self.interreflection},\n  multiple = {self.multiple}\n]"
+                f"  interreflection = {self.interreflection},\n  exact_orders = {self.exact_orders},\n  unbiased = {self.unbiased}\n]"
             )
 
     return DeepCloudsIntegrator

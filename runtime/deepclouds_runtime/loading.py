@@ -22,7 +22,7 @@ from deepclouds_runtime.volume_scene import options_from, volume_scene
 _LOG = logging.getLogger(__name__)
 
 # How a render is done, whatever the input.
-RENDER_OPTIONS = ("mode", "multiple", "environment_directions", "interreflection", "extrapolate", "unit")
+RENDER_OPTIONS = ("mode", "unbiased", "exact_orders", "environment_directions", "interreflection", "extrapolate", "unit")
 _MOST_THREADS = 1024
 SCENE_OPTIONS = ("sensor", "max_depth", "hide_emitters")
 
@@ -65,8 +65,8 @@ def load(
         frames of a full turn around a volume, all of which the camera's distance suits, see `deepclouds_runtime.turntable`.
     **options
         for a volume: the fields of `deepclouds_runtime.volume_scene.VolumeOptions`; for a scene: ``sensor``, ``max_depth``,
-        ``hide_emitters``; for both: ``mode``, ``multiple``, ``environment_directions``, ``interreflection``, ``extrapolate``,
-        ``unit`` (see `Renderer`).
+        ``hide_emitters``; for both: ``mode``, ``unbiased``, ``exact_orders``, ``environment_directions``, ``interreflection``,
+        ``extrapolate``, ``unit`` (see `Renderer`).
 
     Returns
     -------
@@ -88,11 +88,13 @@ def load(
     if path is not None and not path.is_file():
         raise InputError(f"{path}: no such file")
     how = {name: options.pop(name) for name in RENDER_OPTIONS if name in options}
+    if how.get("unbiased") and model is not None:
+        raise InputError(f"model = '{model}': an unbiased render asks no network; leave one of the two out")
     mitsuba(select=is_path)
     if threads is not None:
         _set_threads(threads)
     scene = _scene(source, path, dict(defines or {}), grid, clamp, ignore_emission, fixed, turn, options)
-    if predictor is None and scene.max_depth != 2 and how.get("multiple", "network") == "network":
+    if predictor is None and scene.max_depth != 2 and not how.get("unbiased"):
         from deepclouds.volume.pyramid import optical_size
         from deepclouds_runtime.predictor import predictor_for
 

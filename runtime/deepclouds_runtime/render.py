@@ -17,7 +17,7 @@ def render(
     defines: Mapping[str, str] | None = None,
     model: str | PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
-    error: float = 0.02,
+    error: float | None = None,
     partial: Callable[[RenderResult], None] | None = None,
     interrupted: Callable[[], bool] | None = None,
     **options: Any,
@@ -39,7 +39,7 @@ def render(
     progress
         is called with the share of the work done, 0 to 1.
     error
-        noise of a pixel to aim at, root of the mean square over the mean.
+        noise of a pixel to aim at, root of the mean square over the mean (default 0.02).
     partial
         is called with the image so far, first with a quick look; see `deepclouds_runtime.renderer.Renderer.render`.
     interrupted

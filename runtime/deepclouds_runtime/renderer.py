@@ -24,10 +24,11 @@ from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import confidence, doubtful, relative_errors, warning
 from deepclouds_runtime.disc import background
+from deepclouds_runtime.error_parts import error_parts
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
 from deepclouds_runtime.lights import Environment, Shade, environment
-from deepclouds_runtime.scattering import NetworkScattering, Predicts, WalkScattering
+from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped, WalkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.surfaces import Reflectors, reflected, reflected_from_cloud
@@ -36,14 +37,17 @@ from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 _LOG = logging.getLogger(__name__)
 Image = NDArray[np.float32]
 
-# Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB.
-_PASS = 1 << 19
+# Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB. Those that end in a query or a walk take long, and
+# an interruption waits for them.
+_PASS, _SLOW_PASS = 1 << 19, 1 << 16
 # A pixel's samples are in flight together.
 _MOST_SAMPLES = 1 << 20
 # What the fast mode stops at by itself: a scene whose noise is still too large then says so.
 _MOST_AUTOMATIC = 1024
 # Noise of a pixel that the fast mode aims at, over the mean.
 ERROR = 0.02
+# Samples a pixel of which path tracing foretells how many it will take.
+_FORETELL = 16
 # Values below this share of the brightest do not count in the noise.
 _DARK = 0.02
 # Error of the interpolation at a point over the noise of a pixel, both aimed at: along rays and between pixels that of points averages out.
@@ -76,7 +80,7 @@ class Statistics:
     Attributes
     ----------
     mode
-        ``"fast"`` or ``"reference"``.
+        ``"fast"``, ``"reference"``, or ``"path-traced"``.
     spp
         samples of the pixels that took most of them.
     mean_spp
@@ -93,6 +97,8 @@ class Statistics:
     network
         where the network knows its errors: ``error`` to expect of the cloud's light, and ``doubtful``, the share of that light in pixels of
         low confidence.
+    error
+        both parts of the image's error, and how they are known: see `deepclouds_runtime.error_parts.error_parts`.
     audit
         where walks audited the network: ``walks``; ``network``, its error over regions of the image, root of the mean square over the mean,
         and its energy, each with an interval of 95 %; whether it was ``corrected``, on how many ``levels``, and what is ``remaining``.
@@ -109,6 +115,7 @@ class Statistics:
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
     network: dict[str, float] = field(default_factory=dict)
+    error: dict[str, Any] = field(default_factory=dict)
     audit: dict[str, Any] = field(default_factory=dict)
     memory: dict[str, int] = field(default_factory=dict)
 
@@ -156,9 +163,12 @@ class Renderer:
     scene
         what `deepclouds_runtime.scene.read_scene` returns.
     predictor
-        the network; not needed with ``multiple = "walks"`` or in a scene with ``max_depth = 2``.
-    multiple
-        ``"network"``, or ``"walks"``: J from one Monte Carlo walk a query in place of the network, for tests and references.
+        the network; not needed with `unbiased` or in a scene with ``max_depth = 2``.
+    unbiased
+        whether J comes from Monte Carlo walks, one a sample, in place of the network.
+    exact_orders
+        orders of scattering that are sampled before the network is asked. With 1, single scattering, it is asked about what the camera
+        sees; with n about what light that was scattered n times sees, and no longer interpolated.
     environment_directions
         directions drawn from an environment at each sample of the cloud.
     interreflection
@@ -166,7 +176,7 @@ class Renderer:
         and light from one surface to another, are left out.
     mode
         ``"fast"``: J is predicted at a sparse set of points and interpolated, samples are spent until the noise is as asked; or
-        ``"reference"``: the method as published, where every sample asks the network.
+        ``"reference"``: the method as published, where every sample asks the network. With `unbiased` there is but one.
     extrapolate
         whether the network is asked about media that it was not trained on; by default J then comes from walks.
     unit, origin
@@ -186,7 +196,7 @@ class Renderer:
     Raises
     ------
     InputError
-        for an unknown `multiple` and a unit of length that is none.
+        for options that make no sense, alone or together.
     """
 
     def __init__(
@@ -194,7 +204,8 @@ class Renderer:
         scene: CloudScene,
         predictor: Predicts | None = None,
         *,
-        multiple: str = "network",
+        unbiased: bool = False,
+        exact_orders: int = 1,
         environment_directions: int = 2,
         interreflection: bool = True,
         mode: str = "fast",
@@ -205,32 +216,40 @@ class Renderer:
     ) -> None:
         if mode not in MODES:
             raise InputError(f"mode = '{mode}': there are {' and '.join(repr(m) for m in MODES)}")
-        if multiple not in ("network", "walks"):
-            raise InputError(f"multiple = '{multiple}': J comes from 'network' or 'walks'")
+        if exact_orders < 1:
+            raise InputError(f"exact orders = {exact_orders}: single scattering is always exact; give 1 or more")
+        if unbiased and exact_orders > 1:
+            raise InputError(f"exact orders = {exact_orders}: an unbiased render has all orders exact; leave one of the two out")
+        if unbiased and mode != "fast":
+            raise InputError(f"mode = '{mode}': an unbiased render asks no network; leave one of the two out")
         if environment_directions < 1:
             raise InputError(f"environment directions = {environment_directions}: at least one is drawn at each sample")
         if unit is not None and not (math.isfinite(unit) and unit > 0):
             raise InputError(f"unit = {unit:g}: give a length in world units, about the mean free path in the cloud")
         started = time.perf_counter()
         self.scene = scene
-        self._multiple, self.mode = multiple, mode
+        self.mode, self.unbiased, self._exact_orders = mode, unbiased, exact_orders
         self.environment_directions = environment_directions
         self.predictor = predictor
         self._types = types_of(mitsuba())
         self._field = Field(self._types, scene.volume, scene.scale)
         self._network: NetworkScattering | None = None
-        if scene.max_depth != 2 and multiple == "network":
+        # Whether paths are traced in place of the network, asked for or not.
+        self._walks = unbiased and scene.max_depth != 2
+        if scene.max_depth != 2 and not unbiased:
             if predictor is None:
                 raise InputError("multiple scattering needs a model; give one, or render single scattering alone (max_depth 2)")
             self._network = NetworkScattering(self._field, predictor, unit, origin)
         # Single scattering alone stops before light that surfaces have reflected, as volpath with max_depth 2 does.
         self._interreflection = interreflection and scene.surfaces is not None and scene.max_depth != 2
         self.notes = scene.notes
+        if unbiased:
+            self.notes += ("unbiased: paths are traced with our own tracker until the noise is as asked; no network is asked",)
         if self._network is not None and (unknown := _unknown(self._network, predictor, scene)):
             instead = "extrapolated" if extrapolate else "path-traced in place of it, noisy and slow ('extrapolate' asks it all the same)"
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
             if not extrapolate:
-                self._network, self._multiple = None, "walks"
+                self._network, self._walks = None, True
         self.model_hash: str | None = None
         if self._network is not None:
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
@@ -255,7 +274,7 @@ class Renderer:
         spp: int | None = None,
         seed: int = 0,
         progress: Callable[[float], None] | None = None,
-        error: float = ERROR,
+        error: float | None = None,
         partial: Callable[[RenderResult], None] | None = None,
         interrupted: Callable[[], bool] | None = None,
         estimate: Callable[[float], None] | None = None,
@@ -269,78 +288,107 @@ class Renderer:
         Parameters
         ----------
         spp
-            samples a pixel. By default the fast mode takes as many as `error` asks for, the reference mode those of the camera's sampler.
+            samples a pixel. By default the fast mode takes as many as `error` asks for, the reference mode those of the camera's sampler,
+            which is also the most that paths take that nobody asked for (`extrapolate`).
         seed
             of all random numbers.
         progress
             is called with the share of the work done, 0 to 1.
         error
             of the fast mode: noise of a pixel to aim at, root of the mean square over the mean; the interpolation may add half as much.
+            By default 0.02; in an unbiased render with a `time_limit` the time alone decides.
         partial
             is called with the image so far, first of all with a quick look (fast mode: one sample a pixel with one collision, J at few
             nodes, surfaces without the cloud's light), then after each round of samples but the last. The look is thrown away: the final
             image is the same with and without `partial`, but for rounding.
         interrupted
-            is asked between passes whether to stop. The image is then made of what there is, of one sample of every pixel at least, and
-            its statistics are not ``complete``.
+            is asked between passes, and between batches of a prediction, whether to stop. The image is then made of what there is, of one
+            sample of every pixel at least, and its statistics are not ``complete``. In place of a prediction that was not finished it has
+            that of a quick look, without the light that the cloud throws on surfaces.
         estimate
             is called with the estimated noise after each round.
         audit
-            of the fast mode: measure the network's error in this image with walks, until it is known to be below `error`.
+            of the fast mode: measure the network's error in this image with walks, until it is known to be below `error`, or as many
+            walks are spent as the error is worth.
         correct
             audit, and correct the network's multiple scattering by what the walks say, where they say that it helps. The light that the
             cloud throws on surfaces is not corrected.
         time_limit
-            seconds: the audit ends after half of them, sampling with the round in which they are over. The result then depends on the
-            machine. By default the audit ends after four walks a pixel, at least 262,144.
+            seconds: the audit ends after half of them, sampling with the last round that should end in time. The result then depends on the
+            machine.
 
         Raises
         ------
         InputError
-            when `spp` is below 1 or above 1,048,576, `error` or `time_limit` is not positive, or the reference mode is to be audited.
+            when `spp` is below 1 or above 1,048,576, `error` or `time_limit` is not positive, or what is to be audited is not interpolated.
         """
         scene, types = self.scene, self._types
+        timed = self.unbiased and error is None and time_limit is not None
+        error = ERROR if error is None else error
         if not error > 0:
             raise InputError(f"error = {error}: give the noise to aim at as a share of the mean, for example {ERROR}")
         if time_limit is not None and not time_limit > 0:
             raise InputError(f"time = {time_limit:g}: give the seconds that the render may take, for example 10")
         if (audit or correct) and self.mode != "fast":
             raise InputError(f"mode = '{self.mode}': only the fast mode is audited and corrected; choose mode 'fast'")
-        fast = self.mode == "fast" and (self._network is not None or scene.max_depth == 2)
-        most = self.samples(spp) if spp is not None or not fast else _MOST_AUTOMATIC
+        if (audit or correct) and self.unbiased:
+            raise InputError("an unbiased render asks no network that could be audited or corrected; leave one of the two out")
+        if (audit or correct) and self._exact_orders > 1:
+            raise InputError(
+                f"exact orders = {self._exact_orders}: the network is audited and corrected with 1 only; leave one of the two out"
+            )
         started = time.perf_counter()
         scattering = None
         if scene.max_depth != 2:
-            scattering = self._network if self._multiple == "network" else WalkScattering(self._field, 1, seed)
-        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering), self._lights()
+            scattering = WalkScattering(self._field, 1, seed) if self._walks else self._network
+        adaptive = self.mode == "fast"
+        # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
+        sampled = adaptive and scattering is not None and (self._walks or self._exact_orders > 1)
+        fast = adaptive and not sampled
+        most = self.samples(spp) if spp is not None or not adaptive or (self._walks and not self.unbiased) else _MOST_AUTOMATIC
+        if spp is None and self.unbiased:
+            most = _MOST_SAMPLES
+        exact = 1 if self._walks else self._exact_orders
+        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, exact=exact), self._lights()
         camera = Camera(types, scene.sensor)
-        work = _Work(scene, camera, cloud, lights, lights, types, seed, self._interreflection)
+        work = _Work(scene, camera, cloud, lights, lights, types, seed, self._interreflection, sampled=sampled)
         work.spent("lights", started)
-        if fast and partial is not None:
+        if adaptive and not self._walks and partial is not None:
             clock = time.perf_counter()
-            look = _Work(scene, camera, cloud, lights, lights, types, seed, False, depths=1)
-            look.prepare(math.inf, quick=True)
+            look = self._quick_look(cloud, lights, camera, seed)
             look.round(0, 1, most, None)
             partial(self._result(look, started, None, False))
             work.counts.queries += look.counts.queries
             work.spent("quick look", clock)
-        if fast and self._interreflection:
-            work.prepare_thrown(_INTERPOLATION * error)
-        if self._interreflection:
-            clock = time.perf_counter()
-            reflectors = Reflectors(work.thrower, lights, seed & 0xFFFFFFFF, work.counts)
-            work.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
-            work.spent("probe", clock)
-        if fast:
-            work.prepare(_INTERPOLATION * error)
-            if audit or correct:
-                half_time = math.inf if time_limit is None else started + 0.5 * time_limit
-                work.audit(correct, error, half_time, interrupted)
+        try:
+            if self._network is not None:
+                self._network.stop = interrupted
+            if adaptive and not self._walks and self._interreflection:
+                work.prepare_thrown(_INTERPOLATION * error)
+            if self._interreflection:
+                clock = time.perf_counter()
+                reflectors = Reflectors(work.thrower, lights, seed & 0xFFFFFFFF, work.counts)
+                work.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
+                work.spent("probe", clock)
+            if fast:
+                work.prepare(_INTERPOLATION * error)
+        except Stopped:
+            assert self._network is not None
+            self._network.stop = None
+            look = self._quick_look(cloud, lights, camera, seed)
+            look.round(0, 1, most, None)
+            return self._result(look, started, None, False)
+        finally:
+            if self._network is not None:
+                self._network.stop = None
+        if fast and (audit or correct):
+            half_time = math.inf if time_limit is None else started + 0.5 * time_limit
+            work.audit(correct, error, half_time, interrupted)
         noise = math.inf
         stopped = False
-        if (spp is not None or not fast) and partial is None and interrupted is None:
+        if (spp is not None or not adaptive) and partial is None and interrupted is None:
             work.round(0, most, most, progress)
-        elif spp is not None or not fast:
+        elif spp is not None or not adaptive:
             # The same samples, in rounds that double their number.
             work.round(0, 1, most, progress)
             while work.samples < most and not (stopped := interrupted is not None and interrupted()):
@@ -358,29 +406,47 @@ class Renderer:
             growth = 2.0
             work.round(0, 1, most, None)
             end = math.inf if time_limit is None else started + time_limit
-            while work.samples < most and not noise <= error and not (stopped := interrupted is not None and interrupted()):
-                if work.samples > 1 and time.perf_counter() > end:
-                    break
+            pace = 0.0
+            while work.samples < most and (timed or not noise <= error) and not (stopped := interrupted is not None and interrupted()):
                 before, done = work.beauty(), work.samples
+                more = min(math.ceil(done * (growth - 1)), most - done)
+                if done > 1 and not math.isinf(end):
+                    left = end - time.perf_counter()
+                    more = min(more, int(left / pace)) if left > 0 else 0
+                if more < 1:
+                    break
                 if partial is not None:
                     partial(self._result(work, started, noise, False))
-                stopped = work.round(done, min(math.ceil(done * (growth - 1)), most - done), most, None, interrupted)
+                clock = time.perf_counter()
+                stopped = work.round(done, more, most, None, interrupted)
                 if stopped:
                     break
-                noise, growth = work.settle(before, done, error)
+                pace = max(time.perf_counter() - clock, 1e-6) / more
+                # Blocks that rested because their paths found little light by chance would make an unbiased image dark.
+                noise, growth = work.settle(before, done, error, rest=not self._walks)
+                if self._walks and done < _FORETELL <= work.samples and noise > error:
+                    _say_ahead(work.samples, noise, error, end, most, pace)
                 if estimate is not None:
                     estimate(noise)
                 if progress is not None:
-                    progress(min(error / max(noise, 1e-9), 1.0) ** 2)
+                    done_share = min(error / max(noise, 1e-9), 1.0) ** 2
+                    progress(done_share if not timed else min((time.perf_counter() - started) / (end - started), 1.0))
         return self._result(work, started, noise, not stopped)
+
+    def _quick_look(self, cloud: Cloud, lights: Lights, camera: Camera, seed: int) -> _Work:
+        """What a quick look is rendered with: one collision a sample, few nodes, surfaces without the cloud's light."""
+        look = _Work(self.scene, camera, replace(cloud, exact=1), lights, lights, self._types, seed, False, depths=1)
+        look.prepare(math.inf, quick=True)
+        return look
 
     def _result(self, work: _Work, started: float, noise: float | None, complete: bool) -> RenderResult:
         """The image so far; `noise` as estimated, infinite or None where it was not."""
         channels = work.image()
         seconds = {"load": self._load_seconds, **work.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
+        mode = "reference" if self.mode == "reference" else "path-traced" if self._walks else "fast"
         statistics = Statistics(
-            "reference" if work.sources is None else "fast",
+            mode,
             int(work.taken.max()),
             float(work.taken.mean()),
             noise if noise is not None and math.isfinite(noise) else None,
@@ -397,6 +463,17 @@ class Renderer:
         if "confidence" in channels:
             statistics.network = doubtful(channels["confidence"], channels)
             notes += tuple(filter(None, [warning(statistics.network)]))
+        whole = float(rgb.sum(dtype=np.float64))
+        indirect = sum(float(channels[f"volume_indirect.{c}"].sum(dtype=np.float64)) for c in COLOURS)
+        statistics.error = error_parts(
+            statistics.noise,
+            [source.error for source in work.sources or []],
+            indirect / whole if whole > 0 else 0.0,
+            self._network is not None,
+            work.found,
+            statistics.network,
+            getattr(getattr(self.predictor, "metadata", None), "metrics", {}),
+        )
         return RenderResult(rgb, channels["A"], channels, seconds, replace(work.counts), statistics, notes)
 
     def _lights(self) -> Lights:
@@ -421,6 +498,7 @@ class _Work:
     seed: int
     interreflection: bool
     depths: int = _DEPTHS
+    sampled: bool = False
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
     sums: dict[str, Image] = field(default_factory=dict)
@@ -437,10 +515,12 @@ class _Work:
         self._active = np.arange(width * height, dtype=np.uint32)
         self.taken = np.zeros(width * height, np.float32)
         self._variance = np.zeros((width * height, 3), np.float64)
+        # Of the means of rounds: how many there were after the first, and their sum of squared deviations, weighted by samples.
+        self._rounds, self._scatter = 0, np.zeros((width * height, 3), np.float64)
 
     def skipped(self) -> dict[str, int]:
         """Queries that were not needed, by reason; a sample counts as the one query that the reference mode would ask."""
-        if self.sources is None:
+        if self.sources is None or self.sampled:
             return {"thin samples": self.counts.skipped}
         distinct = len({a for a in self.cloud.albedo if a > 0})
         return {
@@ -453,7 +533,7 @@ class _Work:
     @property
     def thrower(self) -> Cloud:
         """The cloud as surfaces see it."""
-        return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round)
+        return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
 
     def prepare_thrown(self, tolerance: float) -> None:
         """Predict multiple scattering for the light that the cloud throws on surfaces; from then on their rays ask no network."""
@@ -560,7 +640,7 @@ class _Work:
     ) -> bool:
         """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all; returns whether it was interrupted."""
         total = len(self._active)
-        pixels = max(1, _PASS // samples)
+        pixels = max(1, (_SLOW_PASS if self.sampled else _PASS) // samples)
         for start in range(0, total, pixels):
             if interrupted is not None and interrupted():
                 return True
@@ -591,15 +671,21 @@ class _Work:
         width, height = self.scene.size
         after, active = self.beauty(), self._active
         # Of a mean of which the last part is independent of the first.
-        change = (after[active] - before[active]).astype(np.float64)
-        self._variance[active] = np.square(change) * (done / (self.samples - done))
+        change = np.square((after[active] - before[active]).astype(np.float64))
+        if rest:
+            self._variance[active] = change * (done / (self.samples - done))
+        else:
+            # Where all pixels have the same rounds, each round tells as much as any other.
+            self._rounds += 1
+            self._scatter += change * (done / (self.samples - done) * self.samples)
+            self._variance = self._scatter / (self._rounds * self.samples)
         lit = after > _DARK * np.quantile(after, 0.999)
         if not lit.any():
             return 0.0, 1.0
         allowed = (error * float(after[lit].mean(dtype=np.float64))) ** 2 * np.count_nonzero(lit)
         noise = error * math.sqrt(float(self._variance[lit].sum()) / allowed) if allowed > 0 else 0.0
         if not rest:
-            return noise, 1.0
+            return noise, float(np.clip((noise / error) ** 2, 1.0 + 0.5 / self.samples, 4.0))
         # A pixel's own estimate has two numbers behind it, a block's has many.
         index = np.arange(width * height)
         columns = -(-width // _BLOCK)
@@ -641,10 +727,13 @@ class _Work:
         if scene.surfaces is not None:
             interaction, end, shown = self._surfaces(origin, direction, end)
         clock = time.perf_counter()
-        if self.sources is None:
+        if self.sources is None and not self.sampled:
             light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
         else:
-            light = fast_cloud_light(self.cloud, self.on_cloud, self.sources, origin, direction, end, numbers, self.counts, self.depths)
+            sources = self.sources or []
+            light = fast_cloud_light(
+                self.cloud, self.on_cloud, sources, origin, direction, end, numbers, self.counts, self.depths, self.sampled
+            )
         dr.eval(light.direct, light.indirect)
         dr.sync_thread()
         self.spent("cloud", clock)
@@ -741,3 +830,12 @@ def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: Clou
     longest = float(np.linalg.norm(scene.volume.to_world[:3, :3], axis=0).max())
     found: list[str] = outside(scene.phase, scene.albedo, longest / network.descriptor.unit)
     return found
+
+
+def _say_ahead(samples: int, noise: float, error: float, end: float, most: int, pace: float) -> None:
+    """Say what a path-traced image will take."""
+    whole = min(samples * (noise / error) ** 2, most)
+    seconds = (whole - samples) * pace
+    left = end - time.perf_counter()
+    text = f"path tracing: noise of a pixel is about {noise:.2g} after {samples} samples; {error:g} takes about {whole:,.0f}"
+    _LOG.info("%s, %.0f s more%s", text, seconds, "" if seconds <= left else f", but there are only {max(left, 0.0):.0f} s left")

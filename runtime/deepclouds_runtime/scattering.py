@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import rows
 from deepclouds.descriptor import LEVELS, POINTS, Descriptor
 from deepclouds.medium.field import Field
 from deepclouds.medium.one_sun import trace_one_sun
@@ -19,6 +20,10 @@ from deepclouds.model import aux_inputs
 Phase = tuple[float, float, float]
 # Stencils are 9 kB each: a chunk of them stays below 100 MB.
 _CHUNK = 8192
+
+
+class Stopped(Exception):
+    """A prediction was given up because somebody asked for it."""
 
 
 class MultipleScattering(Protocol):
@@ -60,6 +65,11 @@ class NetworkScattering:
         the network.
     unit, origin
         see `deepclouds.descriptor.Descriptor`; fixed for a sequence of frames.
+
+    Attributes
+    ----------
+    stop
+        is asked before each batch whether to give up, by `Stopped`; None goes on.
     """
 
     def __init__(self, field: Field, predictor: Predicts, unit: float | None = None, origin: NDArray[np.float64] | None = None) -> None:
@@ -67,6 +77,7 @@ class NetworkScattering:
         # What is built on the field is aligned to it too.
         self.anchor = origin
         self.predictor = predictor
+        self.stop: Callable[[], bool] | None = None
         self._types = field.types
         trusted = getattr(getattr(predictor, "metadata", None), "trust", None) is not None
         self._errors: Callable[..., NDArray[np.float32]] | None = getattr(predictor, "errors", None) if trusted else None
@@ -107,6 +118,8 @@ class NetworkScattering:
             return result, expected
         stencils = np.empty((min(n, _CHUNK), LEVELS, POINTS), np.float32)
         for start in range(0, n, _CHUNK):
+            if self.stop is not None and self.stop():
+                raise Stopped
             stop = min(start + _CHUNK, n)
             part = [_slice(self._types, v, start, stop) for v in (points, w, omega_sun)]
             stencil = stencils[: stop - start]
@@ -139,7 +152,7 @@ class WalkScattering:
 
     def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
         """J of the points; see `MultipleScattering`."""
-        x, d, suns = (np.array(v).T.astype(np.float32) for v in (points, w, omega_sun))
+        x, d, suns = (rows(v) for v in (points, w, omega_sun))
         n = len(x)
         seed = int(self._streams.spawn(1)[0].generate_state(1, np.uint64)[0])
         values = trace_one_sun(

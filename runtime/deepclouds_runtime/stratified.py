@@ -70,9 +70,13 @@ class Stratified:
         index = self._sample * parts + part
         return _unit(self._types, index * u32(_STEPS[dimension]) + shift)
 
-    def unrelated(self) -> Stratified:
-        """Numbers for the same lanes that are independent of these, and of each other: for integrals inside of an integral."""
-        other = Stratified(self._types, self._pixel, self._sample, self._count, self._seed ^ self._types.UInt32(0xC2B2AE35))
+    def unrelated(self, stream: int = 0) -> Stratified:
+        """Numbers for the same lanes that are independent of these, and of each other: for integrals inside of an integral.
+
+        Each `stream` has numbers of its own; the same one asked for twice in a row leads back to where it began.
+        """
+        mask = (0xC2B2AE35 + 0x9E3779B9 * stream) & 0xFFFFFFFF
+        other = Stratified(self._types, self._pixel, self._sample, self._count, self._seed ^ self._types.UInt32(mask))
         other._spread = False
         return other
 

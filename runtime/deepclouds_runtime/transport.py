@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -21,6 +21,7 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import TAU_OPAQUE, distance_at, optical_depth
 from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
 from deepclouds_runtime import stratified
+from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.disc import discs
 from deepclouds_runtime.lights import LightSource, Shade
 from deepclouds_runtime.scattering import MultipleScattering
@@ -59,6 +60,9 @@ class Cloud:
         source of J, or None for single scattering alone.
     known
         J of each colour channel as a function of points and directions, where it is known without `scattering`.
+    exact
+        orders of scattering that are sampled before `scattering` is asked: with 1 it is asked at the first collision of a ray, with 2 at
+        the second one, and so on.
     """
 
     field: Field
@@ -66,6 +70,7 @@ class Cloud:
     phase: tuple[float, float, float]
     scattering: MultipleScattering | None
     known: Callable[[Any, Any], list[Any]] | None = None
+    exact: int = 1
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,7 @@ def cloud_light(
     take = taker(types, lanes)
     d = take(direction)
     points = dr.fma(d, take(distance), take(origin))
-    _scatter(cloud, lights, points, d, take(opacity), take(weight), numbers.take(lanes), counts, lanes, result)
+    scatter(cloud, lights, points, d, take(opacity), take(weight), numbers.take(lanes), counts, lanes, result)
     return result
 
 
@@ -164,7 +169,7 @@ def taker(types: Any, lanes: Any) -> Callable[[Any], Any]:
     return take
 
 
-def _scatter(
+def scatter(
     cloud: Cloud,
     lights: Lights,
     points: Any,
@@ -176,10 +181,33 @@ def _scatter(
     lanes: Any,
     result: CloudLight,
 ) -> None:
-    """Add single and multiple scattering at `points` to the lanes of `result`, for every light."""
+    """Add single and multiple scattering at points of the cloud to lanes of `result`, for every light.
+
+    Parameters
+    ----------
+    cloud, lights, counts
+        as for `cloud_light`.
+    points, w
+        Array3f: the points, and the unit directions in which they are seen.
+    opacity
+        Float: the light is multiplied by it.
+    importance
+        Float: how much of that counts in the image.
+    numbers
+        random numbers of the points.
+    lanes
+        UInt32: lane of `result` that each point adds to.
+    result
+        is updated, but for what its rays hide.
+    """
     types = cloud.field.types
     channel_count = len(cloud.albedo)
     albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
+    if cloud.exact > 1 and cloud.scattering is not None:
+        for c, value in enumerate(single_scattering(replace(cloud, scattering=None), lights, points, w, numbers)):
+            dr.scatter(result.direct[c], value * opacity, lanes)
+        scatter_on(cloud, lights, points, w, opacity, importance, numbers, counts, lanes, result)
+        return
     # Which samples are worth a query is the same for all lights: one that lies in a thin place is so for each of them.
     keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
     asked = numbers.number(stratified.ROULETTE) < keep
@@ -206,6 +234,55 @@ def _scatter(
             dr.scatter(total, value * opacity, lanes)
     for c in range(channel_count):
         dr.scatter(result.direct[c], direct[c] * opacity, lanes)
+
+
+def scatter_on(
+    cloud: Cloud,
+    lights: Lights,
+    points: Any,
+    w: Any,
+    opacity: Any,
+    importance: Any,
+    numbers: Stratified,
+    counts: Counts,
+    lanes: Any,
+    result: CloudLight,
+) -> None:
+    """Add multiple scattering at points of the cloud to lanes of `result` by one more exact order: along a ray from each of them.
+
+    J(x, w) = albedo int p(w . w') L(x, w') dw' with one direction w' from the phase function, and L, along it, of all that was scattered
+    at least once: S1 + J at a collision, where one order less is left to be sampled. The ray ends at surfaces: what they send to x is one
+    of the lights. Parameters are those of `scatter`.
+    """
+    types = cloud.field.types
+    # As for queries: what adds little is followed seldom.
+    keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
+    follow: Any = dr.compress(numbers.number(stratified.ROULETTE) < keep)
+    counts.skipped += dr.width(points) - len(follow)
+    if len(follow) == 0:
+        return
+    take = taker(types, follow)
+    numbers = numbers.take(follow)
+    cosine = sample_two_lobe_cosine(numbers.number(stratified.PHASE_U), *(dr.opaque(types.Float, v) for v in cloud.phase))
+    omega = rotate_to(take(w), cosine, 2 * dr.pi * numbers.number(stratified.PHASE_V))
+    origin, weight = take(points), take(opacity / keep)
+    dr.eval(origin, omega, weight)
+    end = dr.full(types.Float, math.inf, len(follow))
+    if lights.shade.surfaces is not None:
+        mi = mitsuba()
+        hit = lights.shade.surfaces.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega)))
+        end = dr.select(plain(types, hit.is_valid()), plain(types, hit.t), end)
+    deeper = replace(cloud, exact=cloud.exact - 1)
+    brings = weight * take(importance) * dr.opaque(types.Float, max(cloud.albedo))
+    # What the image has of cloud samples are the first collisions of its rays.
+    own = Counts()
+    light = cloud_light(deeper, lights, origin, omega, end, numbers.unrelated(cloud.exact), own, brings)
+    counts.queries += own.queries
+    counts.skipped += own.skipped
+    target = dr.gather(types.UInt32, lanes, follow)
+    for c, albedo in enumerate(cloud.albedo):
+        value = (light.direct[c] + light.indirect[c]) * (weight * dr.opaque(types.Float, albedo))
+        dr.scatter_add(result.indirect[c], value, target)
 
 
 def single_scattering(

@@ -122,7 +122,7 @@ def test_figures_of_an_image_are_shares_of_its_clouds_light() -> None:
 
 
 def test_nothing_is_claimed_where_the_network_is_not_interpolated(cloud: Path) -> None:
-    for options in ({"mode": "reference"}, {"max_depth": 2}, {"multiple": "walks"}, {"optical_depth": 0.0}):
+    for options in ({"mode": "reference"}, {"max_depth": 2}, {"unbiased": True}, {"optical_depth": 0.0}):
         assert "confidence" not in rendered(cloud, Doubting(0.3, 0.3), **options).channels, options
     empty = Seen(np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))
     assert relative_errors([], empty, np.arange(4, dtype=np.uint32), (2, 2)) is None
@@ -154,9 +154,9 @@ def test_fields_that_are_carried_along_refine_nothing() -> None:
 
 def test_media_outside_of_the_training_are_path_traced(cloud: Path) -> None:
     unknown = Doubting(0.1, 0.1, unknown=("g1 = 0.97 (trained on 0 to 0.9)",))
-    found, walked = rendered(cloud, unknown, g=0.97), rendered(cloud, Doubting(0.1, 0.1), g=0.97, multiple="walks")
+    found, walked = rendered(cloud, unknown, g=0.97), rendered(cloud, Doubting(0.1, 0.1), g=0.97, unbiased=True)
     np.testing.assert_array_equal(found.rgb, walked.rgb)
-    assert found.statistics.mode == "reference"
+    assert found.statistics.mode == "path-traced"
     (said,) = found.notes
     assert said.startswith("the model was not trained for g1 = 0.97 (trained on 0 to 0.9): multiple scattering is path-traced")
     assert load(cloud, predictor=unknown, **SUN).model_hash is None

@@ -107,6 +107,33 @@ def test_an_image_says_whether_it_is_complete(renderer: Renderer, tmp_path: Path
     assert not is_complete(path)
 
 
+def test_an_interruption_does_not_wait_for_the_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whole, it would ask for all nodes; given up, for the batches so far and the nodes of a quick look."""
+    monkeypatch.setattr("deepclouds_runtime.scattering._CHUNK", 256)
+    asked: list[int] = []
+
+    class Asked(Smooth):
+        def predict(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
+            asked.append(len(stencil))
+            return super().predict(stencil, aux)
+
+    renderer = load(CLOUD, predictor=Asked(), size=(40, 30))
+    full = renderer.render(8, seed=3)
+    whole, asked[:] = sum(asked), []
+    looked: list[RenderResult] = []
+    renderer.render(1, seed=3, partial=looked.append)
+    look = sum(asked) - whole
+    asked.clear()
+    stopped = renderer.render(8, seed=3, interrupted=lambda: len(asked) >= 2)
+    assert asked[:2] == [256, 256]
+    # No batch more of it: what follows is the quick look, whole.
+    assert sum(asked) == 512 + look < whole
+    assert not stopped.statistics.complete
+    assert stopped.statistics.mean_spp == 1
+    assert stopped.rgb.mean() == pytest.approx(full.rgb.mean(), rel=0.03)
+    assert renderer.render(8, seed=3).rgb.mean() == pytest.approx(full.rgb.mean(), rel=1e-4)
+
+
 def _started(root: Path, arguments: list[str]) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(root / part) for part in (".", "training", "runtime"))}
     code = "import sys; from deepclouds.cli import main; sys.exit(main())"
@@ -122,7 +149,7 @@ def _until(process: subprocess.Popen[str], path: Path) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize(("number", "how"), [(signal.SIGINT, []), (signal.SIGTERM, ["--multiple", "walks"])])
+@pytest.mark.parametrize(("number", "how"), [(signal.SIGINT, []), (signal.SIGTERM, ["--unbiased"])])
 def test_a_signal_ends_the_command_with_what_there_is(root: Path, tmp_path: Path, number: int, how: list[str]) -> None:
     out = tmp_path / "out.exr"
     arguments = ["-o", str(out), "--png", "--size", "48x36", "--spp", "500000", "--progressive", "0", *how]
@@ -146,7 +173,7 @@ def test_a_signal_ends_the_command_with_what_there_is(root: Path, tmp_path: Path
 
 def test_a_second_signal_ends_at_once(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.exr"
-    with _started(root, ["-o", str(out), "--size", "48x36", "--spp", "500000", "--progressive", "1000", "--multiple", "walks"]) as process:
+    with _started(root, ["-o", str(out), "--size", "48x36", "--spp", "500000", "--progressive", "1000", "--unbiased"]) as process:
         _until(process, out)
         stamp = out.stat().st_mtime_ns
         for _ in range(2):

@@ -80,7 +80,7 @@ def _layers_add_up(channels: dict[str, Any]) -> None:
 
 def test_the_command_writes_every_channel_and_its_settings(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "image.exr"
-    arguments = [str(folder / "scene.xml"), "-o", str(out), "--spp", "2", "--seed", "5", "-Dsize=10", "--multiple", "walks", "--png"]
+    arguments = [str(folder / "scene.xml"), "-o", str(out), "--spp", "2", "--seed", "5", "-Dsize=10", "--unbiased", "--png"]
     assert main(arguments) == 0
     image = read_exr(out)
     layers = {f"{layer}.{c}" for layer in LAYERS for c in COLOURS}
@@ -120,8 +120,7 @@ def test_a_volume_needs_nothing_but_its_name(folder: Path, tmp_path: Path, capsy
         str(folder / "density.vol"),
         "-o",
         str(out),
-        "--multiple",
-        "walks",
+        "--unbiased",
         "--spp",
         "1",
         "--size",
@@ -320,9 +319,9 @@ def test_malformed_numbers_end_in_code_2(folder: Path, tmp_path: Path, text: lis
 
 def test_the_plugin_renders_like_the_function(folder: Path, mi: Any) -> None:
     scene = mi.load_file(str(folder / "scene.xml"))
-    plugin = mi.load_dict({"type": "deepclouds", "multiple": "walks", "rr_depth": 1000000})
+    plugin = mi.load_dict({"type": "deepclouds", "unbiased": True, "rr_depth": 1000000})
     image = np.array(mi.render(scene, integrator=plugin, spp=4, seed=3))
-    ours = deepclouds_runtime.render(scene, spp=4, seed=3, multiple="walks")
+    ours = deepclouds_runtime.render(scene, spp=4, seed=3, unbiased=True)
     assert image.shape == (12, 12, 3)
     np.testing.assert_allclose(image, ours.rgb, rtol=1e-4, atol=1e-6)
     assert np.array(scene.sensors()[0].film().bitmap()).shape == (12, 12, 3)
@@ -376,7 +375,7 @@ def test_other_path_lengths_and_variants_are_refused(folder: Path, mi: Any) -> N
     with pytest.raises(RuntimeError, match="does not run in Mitsuba's variant 'scalar_rgb'"):
         mi.load_dict({"type": "deepclouds"})
     with pytest.raises(InputError, match="scalar_rgb"):
-        load(folder / "scene.xml", multiple="walks")
+        load(folder / "scene.xml", unbiased=True)
 
 
 ORDERS = {
@@ -416,7 +415,7 @@ def _python(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_the_demonstration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from deepclouds_runtime.demo import main as demo
 
-    assert demo(["--out", str(tmp_path / "out"), "--size", "24", "--spp", "1", "--multiple", "walks"]) == 0
+    assert demo(["--out", str(tmp_path / "out"), "--size", "24", "--spp", "1", "--unbiased"]) == 0
     assert read_exr(tmp_path / "out" / "demo.exr").channels["volume_opacity"].max() > 0.9
     assert (tmp_path / "out" / "demo.png").is_file()
     assert "demo.png" in capsys.readouterr().out

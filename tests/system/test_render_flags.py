@@ -53,7 +53,6 @@ KEEPING = {
     "--no-interreflection": [],
     "--png": ["{folder}/other.png"],
     "--exposure": ["1"],
-    "--multiple": ["walks"],
     "--progressive": ["0"],
     "--unit": ["0.01"],
     "--skip-existing": [],
@@ -66,6 +65,8 @@ ELSEWHERE = {
     "--help",
     "-D",
     "--mode",
+    "--exact-orders",
+    "--unbiased",
     "--error",
     "--extrapolate",
     "--frames",
@@ -91,7 +92,7 @@ def folder(tmp_path: Path) -> Path:
 
 def _render(folder: Path, arguments: Sequence[str]) -> NDArray[np.float32]:
     out = folder / "image.exr"
-    fixed = ["render", str(CLOUD), "-o", str(out), "--multiple", "walks", "--size", "16x12", "--spp", "1"]
+    fixed = ["render", str(CLOUD), "-o", str(out), "--unbiased", "--size", "16x12", "--spp", "1"]
     assert main([*fixed, *(a.format(folder=folder) for a in arguments)]) == 0
     channels = read_exr(out).channels
     return np.stack([channels[c] for c in "RGBA"], axis=-1)
@@ -150,13 +151,19 @@ def test_good_values_show(folder: Path) -> None:
         (["--sensor", "1"], "the option 'sensor' belongs to a scene"),
         (["-Dx=1"], "-Dx has no meaning for a volume"),
         (["--variant", "scalar_rgb"], "variant 'scalar_rgb': there are llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb, cuda_ad_mono"),
+        (["--exact-orders", "0"], "--exact-orders: '0' is not a whole number above 0"),
+        (["--exact-orders", "-2"], "--exact-orders: '-2' is not a whole number above 0"),
+        (["--exact-orders", "2", "--unbiased"], "exact orders = 2: an unbiased render has all orders exact"),
+        (["--unbiased", "--mode", "reference"], "mode = 'reference': an unbiased render asks no network"),
+        (["--unbiased", "--model", "first"], "model = 'first': an unbiased render asks no network"),
+        (["--unbiased", "--correct"], "an unbiased render asks no network that could be audited or corrected"),
+        (["--exact-orders", "2", "--audit"], "exact orders = 2: the network is audited and corrected with 1 only"),
         (["--threads", "0"], "--threads: '0' is not a whole number above 0"),
         (["--exposure", "inf", "--png"], "exposure = inf: give stops between"),
         (["--png", "{folder}/x.jpg"], "x.jpg: the name must end in .png"),
         (["--png", "{folder}/nowhere/x.png"], "the folder {folder}/nowhere does not exist; create it first"),
         (["--output", "{folder}/x.png"], "x.png: the name must end in .exr"),
         (["--model", "{folder}"], "no such model file"),
-        (["--multiple", "none"], "--multiple: invalid choice: 'none'"),
     ],
 )
 def test_bad_values_end_in_code_2(folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:

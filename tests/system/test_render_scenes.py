@@ -146,7 +146,7 @@ def _images(mi: ModuleType, file: Path, scene: Scene) -> tuple[NDArray[np.float6
     loaded = mi.load_file(str(file))
     theirs = np.stack([np.array(mi.render(loaded, spp=scene.spp, seed=1000 + k), np.float64) for k in range(SEEDS)])
     mi.set_variant("llvm_ad_rgb")
-    renderer = Renderer(read_scene(mi.load_file(str(file))), multiple="walks")
+    renderer = Renderer(read_scene(mi.load_file(str(file))), unbiased=True)
     results = [renderer.render(scene.spp // 2, seed=k) for k in range(SEEDS)]
     ours = np.stack([np.concatenate([r.rgb, r.alpha[..., None]], axis=-1, dtype=np.float64) for r in results])
     return theirs, ours

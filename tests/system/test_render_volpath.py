@@ -148,7 +148,7 @@ def test_walks_agree_with_volpath(mi: ModuleType, folder: Path, name: str) -> No
     loaded = mi.load_file(str(file))
     theirs = np.stack([_tiles(np.array(mi.render(loaded, spp=scene.spp, seed=1000 + k))) for k in range(SEEDS)])
     mi.set_variant("llvm_ad_rgb")
-    renderer = Renderer(read_scene(mi.load_file(str(file))), multiple="walks")
+    renderer = Renderer(read_scene(mi.load_file(str(file))), unbiased=True)
     results = [renderer.render(scene.spp // 2, seed=k) for k in range(SEEDS)]
     ours = np.stack([_tiles(np.concatenate([r.rgb, r.alpha[..., None]], axis=-1)) for r in results])
 
@@ -172,7 +172,7 @@ def test_white_furnace(mi: ModuleType, folder: Path, g: float) -> None:
     file = folder / "furnace.xml"
     file.write_text(_xml(Scene('<emitter type="constant"><float name="radiance" value="1"/></emitter>', g=g, albedo="1 1 1")))
     mi.set_variant("llvm_ad_rgb")
-    renderer = Renderer(read_scene(mi.load_file(str(file))), multiple="walks")
+    renderer = Renderer(read_scene(mi.load_file(str(file))), unbiased=True)
     tiles = np.stack([_tiles(renderer.render(64, seed=k).rgb)[..., 0] for k in range(SEEDS)])
     error = tiles.std(axis=0, ddof=1) / np.sqrt(SEEDS)
     assert np.all(np.abs(tiles.mean(axis=0) - 1) < 6.5 * error + 2e-3)

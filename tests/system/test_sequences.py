@@ -27,7 +27,7 @@ from deepclouds.exr import read_exr
 from deepclouds.volume import Volume, read_vol, write_vol
 from deepclouds.volume.pyramid import mean_extinction
 
-SIZE = ["--size", "16x12", "--spp", "2", "--multiple", "walks", "--quiet"]
+SIZE = ["--size", "16x12", "--spp", "2", "--unbiased", "--quiet"]
 
 
 @pytest.fixture(autouse=True)
@@ -82,10 +82,10 @@ def test_what_is_fixed_is_that_of_the_key_frames(folder: Path) -> None:
     assert 1 / fixed.unit == pytest.approx(fixed.extinction * squares / sums, rel=1e-5)
     # One frame alone is what it is without a sequence.
     alone = fixed_by(files[1:2], VolumeOptions(optical_depth=10.0))
-    plain = load(files[1], multiple="walks", optical_depth=10.0, size=(8, 8))
+    plain = load(files[1], unbiased=True, optical_depth=10.0, size=(8, 8))
     assert alone.extinction == plain.scene.scale
     assert alone.unit == pytest.approx(1 / (plain.scene.scale * mean_extinction(volumes[1])))
-    within = load(files[1], multiple="walks", optical_depth=10.0, size=(8, 8), fixed=alone)
+    within = load(files[1], unbiased=True, optical_depth=10.0, size=(8, 8), fixed=alone)
     np.testing.assert_array_equal(
         np.array(within.scene.sensor.world_transform().matrix), np.array(plain.scene.sensor.world_transform().matrix)
     )
@@ -149,11 +149,11 @@ def test_a_turn_goes_the_way_azimuths_grow(up: str, first: tuple[int, ...], seco
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_frames_of_a_turn_are_the_views_of_their_azimuths(folder: Path, up: str) -> None:
     path = folder / "puff_0003.vol"
-    turned = load(path, multiple="walks", size=(16, 12), view=(20, 10), up=up, turn=4)
+    turned = load(path, unbiased=True, size=(16, 12), view=(20, 10), up=up, turn=4)
     table = Turntable(turned.scene.sensor, 4, pivot(framed_corners(turned.scene.volume), up), up)
     for frame in (1, 2, 4):
         table.turn(frame)
-        there = load(path, multiple="walks", size=(16, 12), view=(20 + 90 * (frame - 1), 10), up=up, turn=4)
+        there = load(path, unbiased=True, size=(16, 12), view=(20 + 90 * (frame - 1), 10), up=up, turn=4)
         np.testing.assert_allclose(
             np.array(turned.scene.sensor.world_transform().matrix), np.array(there.scene.sensor.world_transform().matrix), atol=1e-5
         )
@@ -186,7 +186,7 @@ def test_a_scene_turns_around_its_cloud(folder: Path) -> None:
       </shape></scene>"""
     )
     arguments = [str(folder / "scene.xml"), "-o", str(folder / "o.exr"), "--turntable", "4", "--frames", "2-3", "--spp", "1", "--quiet"]
-    assert main(["render", *arguments, "--multiple", "walks"]) == 0
+    assert main(["render", *arguments, "--unbiased"]) == 0
     places = [np.array(_settings(folder / f"o.000{frame}.exr")["camera"]["to_world"])[:3, 3] for frame in (2, 3)]
     middle = pivot(framed_corners(read_vol(folder / "puff_0003.vol")), "y")
     away = np.array([0, 0, 4]) - middle
