@@ -13,6 +13,7 @@ from deepclouds.metrics import ErrorReport
 from deepclouds.replacing import replacing
 
 _LABELS = {
+    "unbiased": "deepclouds, unbiased",
     "octaves": "octaves",
     "volpath": "volpath",
     "oidn": "volpath + OIDN",
@@ -166,7 +167,7 @@ def markdown(rows: Sequence[Row]) -> str:
         r = row.report
         interval = f"{100 * r.rrmse:.2f} [{100 * r.rrmse_interval[0]:.2f}, {100 * r.rrmse_interval[1]:.2f}]"
         energy = f"{100 * r.energy:+.2f} [{100 * r.energy_interval[0]:+.2f}, {100 * r.energy_interval[1]:+.2f}]"
-        peers = equal_error(rows, row) if row.method in OURS else {}
+        peers = equal_error(rows, row) if row.method in (*OURS, "unbiased") else {}
         needed = [f"{peers[m]} s ({peers[m].over(row.seconds_warm)} x)" if m in peers else "" for m in ("volpath", "oidn")]
         cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.3g}"
         flip = "" if r.flip is None else f"{r.flip:.4f}"

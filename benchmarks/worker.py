@@ -3,10 +3,10 @@
     python -m benchmarks.worker METHOD scene.xml --size 96 --spp 16,64 --seed 7 --out folder
 
 METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), reference (its method as published: every sample
-asks the network), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its denoised image) or single (single scattering). Writes one
-EXR an image and `METHOD.json`: for each image its method, model, spp, file, seconds warm and seconds cold; nothing for a model that was
-asked for by name and was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all work that depends on the sun or
-the camera included. Cold: what a first image costs a fresh process, imports and loading included.
+asks the network), unbiased (its own path tracer), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its denoised image) or single
+(single scattering). Writes one EXR an image and `METHOD.json`: for each image its method, model, spp, file, seconds warm and seconds cold;
+nothing for a model that was asked for by name and was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all
+work that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and loading included.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from deepclouds.exr import write_exr
 Image = NDArray[np.float32]
 # Modes of deepclouds, which ask a model, and all methods.
 OURS = ("deepclouds", "corrected", "reference")
-METHODS = (*OURS, "octaves", "volpath", "oidn", "single")
+METHODS = (*OURS, "unbiased", "octaves", "volpath", "oidn", "single")
 # The spp that stands for "what the renderer chooses itself".
 DEFAULT_SPP = 0
 
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     spps = [int(s) for s in options.spp.split(",")]
     options.out.mkdir(parents=True, exist_ok=True)
-    if options.method in OURS:
+    if options.method in (*OURS, "unbiased"):
         rows = render_deepclouds(options.method, options.scene, options.size, spps, options.seed, options.out, options.model)
     elif options.method == "octaves":
         rows = render_octaves(options.scene, options.size, spps, options.seed, options.out)
@@ -64,13 +64,15 @@ def render_deepclouds(
     """Time the runtime: the second render with another seed is the warm one."""
     start = time.perf_counter()
     loading: Any = import_module("deepclouds_runtime.loading")
-    mode = "reference" if method == "reference" else "fast"
-    renderer = loading.load(scene, defines={"size": str(size)}, model=model, mode=mode)
+    how = {"unbiased": True} if method == "unbiased" else {"mode": "reference" if method == "reference" else "fast"}
+    renderer = loading.load(scene, defines={"size": str(size)}, model=model, **how)
     loaded = time.perf_counter() - start
-    # Without weights, paths are traced in the network's place.
-    if renderer.model_hash is None and model is not None:
-        return []
-    name = "walks" if renderer.model_hash is None else renderer.predictor.path.stem
+    name = ""
+    if method != "unbiased":
+        # Without weights, paths are traced in the network's place.
+        if renderer.model_hash is None and model is not None:
+            return []
+        name = "walks" if renderer.model_hash is None else renderer.predictor.path.stem
 
     def render(spp: int, seed: int) -> Image:
         result = renderer.render(None if spp == DEFAULT_SPP else spp, seed, correct=method == "corrected")
