@@ -120,3 +120,11 @@ def background(types: ModuleType, backdrop: Any, suns: Sequence[Sun]) -> Callabl
         return colours, shown
 
     return look
+
+
+def looks_into(types: ModuleType, suns: Sequence[Sun], direction: Any) -> Any:
+    """Whether unit directions meet the disc of a sun, shown by itself or with the backdrop; None where no sun has a size."""
+    inside = None
+    for disc in discs(types, suns, Shade(types, None)):
+        inside = disc.holds(direction) if inside is None else inside | disc.holds(direction)
+    return inside

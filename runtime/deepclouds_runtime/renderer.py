@@ -23,7 +23,7 @@ from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import confidence, doubtful, relative_errors, warning
-from deepclouds_runtime.disc import background
+from deepclouds_runtime.disc import background, looks_into
 from deepclouds_runtime.error_parts import error_parts
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
@@ -515,6 +515,8 @@ class _Work:
         self._active = np.arange(width * height, dtype=np.uint32)
         self.taken = np.zeros(width * height, np.float32)
         self._variance = np.zeros((width * height, 3), np.float64)
+        # Those that look into a sun's disc: so bright, they would be all that counts in the noise.
+        self._dazzled = np.zeros(width * height, bool)
         # Of the means of rounds: how many there were after the first, and their sum of squared deviations, weighted by samples.
         self._rounds, self._scatter = 0, np.zeros((width * height, 3), np.float64)
 
@@ -669,7 +671,7 @@ class _Work:
         The noise of the whole image over the mean, and by how much the number of samples of the remaining pixels should grow.
         """
         width, height = self.scene.size
-        after, active = self.beauty(), self._active
+        after, active = np.where(self._dazzled[:, None], 0, self.beauty()), self._active
         # Of a mean of which the last part is independent of the first.
         change = np.square((after[active] - before[active]).astype(np.float64))
         if rest:
@@ -760,6 +762,9 @@ class _Work:
             sky, shines = look(direction)
             self._collect(where, "background", [value * behind for value in sky])
             alpha = alpha + dr.select(shines, behind, 0)
+            into = looks_into(types, scene.suns, direction)
+            if into is not None:
+                self._dazzled[pixels] |= np.array(dr.block_sum(dr.select(into, types.Float(1), 0), samples)) > 0
         self._collect(where, "A", [alpha])
         self.spent("surfaces and background", clock)
 

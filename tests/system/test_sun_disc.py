@@ -170,6 +170,21 @@ def test_a_volume_under_a_disc_agrees_with_volpath(mi: Any) -> None:
     assert hidden.channels["background.R"].max() == 0
 
 
+def test_a_disc_in_the_picture_does_not_hide_noise(mi: Any) -> None:
+    """Rationale: it is a thousand times as bright as the cloud, so noise over the mean of all pixels would be nothing at once.
+    Expected: about as many samples as for the same picture without the disc."""
+    volume = Volume.from_box(_density(), (-1, -1, -1), (1, 1, 1))
+    options = VolumeOptions(optical_depth=4, sky=(0.0,), sun=(170.0, 12.0), sun_diameter=12.0, size=(32, 32), max_depth=2)
+    shown, hidden = (
+        Renderer(volume_scene(volume, replace(options, hide_emitters=hide), "blob")).render(error=0.02) for hide in (False, True)
+    )
+    assert shown.rgb.max() > 10 * hidden.rgb.max()
+    assert hidden.statistics.mean_spp > 8
+    assert shown.statistics.mean_spp > 0.6 * hidden.statistics.mean_spp
+    assert shown.statistics.noise is not None
+    assert 0.002 < shown.statistics.noise < 0.02
+
+
 @pytest.mark.parametrize("limb", [(), ((1.5,), (1.1,), (0.4,))])
 @pytest.mark.parametrize("diameter", [0.53, 60.0])
 def test_a_disc_brings_its_irradiance(mi: Any, diameter: float, limb: tuple[tuple[float, ...], ...]) -> None:
