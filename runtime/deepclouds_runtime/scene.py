@@ -11,7 +11,7 @@ from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.merging import merged
-from deepclouds_runtime.scene_lights import LIGHT_NAMES, Sun, read_lights
+from deepclouds_runtime.scene_lights import LIGHT_NAMES, Sun, disc_notes, read_lights
 from deepclouds_runtime.scene_medium import read_medium
 
 _LOG = logging.getLogger(__name__)
@@ -102,6 +102,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     media = [read_medium(container) for container in containers]
     medium = media[0] if len(media) == 1 else merged(media, notes)
     lights = read_lights(scene.emitters())
+    notes.extend(disc_notes(lights.suns))
     integrator = scene.integrator()
     if max_depth is None:
         max_depth = _integrator_depth(integrator)

@@ -14,6 +14,8 @@ from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.sunsky import split
 
 LIGHT_NAMES = "`directional`, `constant`, `envmap` and `sunsky`"
+# Radians from which the middle of a disc stands for the whole less well than a network predicts: docs/rendering.md has measurements.
+_WIDE = math.radians(2.51)
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
 
 
@@ -41,6 +43,15 @@ class Sun:
     radius: float = 0.0
     limb: tuple[tuple[float, ...], ...] = ()
     shown: bool = False
+
+
+def disc_notes(suns: Iterable[Sun]) -> tuple[str, ...]:
+    """What is approximated for suns whose discs are wide, in sentences."""
+    return tuple(
+        f"the sun's disc of {math.degrees(2 * sun.radius):.3g} degrees is wide: in the fast mode multiple scattering sees its middle alone"
+        for sun in suns
+        if sun.radius > _WIDE
+    )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.scene import CloudScene, check_depth, check_size
-from deepclouds_runtime.scene_lights import read_lights
+from deepclouds_runtime.scene_lights import disc_notes, read_lights
 
 _FOV = 30.0
 _MARGIN = 1.15
@@ -132,17 +132,19 @@ def volume_scene(
     channels = len(mi.Spectrum())
     albedo = _three(options.albedo) if channels == 3 else (float(np.dot(_three(options.albedo), (0.2126, 0.7152, 0.0722))),)
     radius = math.radians(options.sun_diameter / 2)
+    suns = tuple(dataclasses.replace(sun, radius=radius, shown=radius > 0) for sun in lights.suns)
     return CloudScene(
         volume,
         scale,
         albedo,
         lobes(options),
-        tuple(dataclasses.replace(sun, radius=radius, shown=radius > 0) for sun in lights.suns),
+        suns,
         lights.environment,
         None,
         camera,
         options.hide_emitters,
         check_depth(options.max_depth),
+        disc_notes(suns),
         backdrop=lights.backdrop,
     )
 

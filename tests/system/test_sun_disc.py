@@ -163,9 +163,11 @@ def test_a_volume_under_a_disc_agrees_with_volpath(mi: Any) -> None:
     print(f"\nvolume: {far:.2f} standard errors, {100 * noise:.2f} % noise")
     assert far < LIMIT
     assert noise < 0.02
+    mi.set_variant("llvm_ad_rgb")
+    assert not volume_scene(volume, replace(options, sun_diameter=5.0), "blob").notes
+    assert "disc of 12 degrees is wide" in volume_scene(volume, options, "blob").notes[0]
     disc = 12 / (math.pi * math.sin(math.radians(6)) ** 2)
     assert theirs.mean(axis=0).max() > 0.9 * disc
-    mi.set_variant("llvm_ad_rgb")
     hidden = Renderer(volume_scene(volume, replace(options, hide_emitters=True), "blob")).render(4)
     assert hidden.channels["background.R"].max() == 0
 
