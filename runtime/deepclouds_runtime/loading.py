@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -131,7 +131,7 @@ def _scene(
             raise InputError(f"{path}: -D{next(iter(defines))} has no meaning for a volume; it sets a parameter of a scene file")
         wanted = options_from(options)
         volume = read_volume(path, grid, clamp)
-        notes = _emission(path, grid, ignore_emission)
+        notes = _left_out(path, grid, ignore_emission)
         if fixed is None:
             scene = volume_scene(volume, wanted, str(path), turn=turn)
         else:
@@ -147,25 +147,34 @@ def _scene(
     return read_scene(source if path is None else load_xml(path, defines), **options)
 
 
-def _emission(path: Path, grid: str | None, ignore: bool) -> tuple[str, ...]:
-    """Sentences about the light that a cloud gives off and we leave out; raises InputError for it unless we are told to `ignore` it."""
+def _left_out(path: Path, grid: str | None, ignore: bool) -> tuple[str, ...]:
+    """Sentences about a file's other grids; raises InputError for those that give off light, unless we are told to `ignore` it."""
     if path.suffix.lower() != ".vdb":
         return ()
     # Loads the native module, so only here.
     from deepclouds.volume.emission import emissive_grids
+    from deepclouds.volume.vdb import chosen_grid
 
-    found = emissive_grids(path, grid)
-    if not found:
-        return ()
-    named = f"grid{'s' if len(found) > 1 else ''} {', '.join(repr(name) for name in found)}"
-    if not ignore:
+    notes = []
+    headers, chosen = chosen_grid(path, grid)
+    light = emissive_grids(path, grid)
+    others = [h["unique_name"] for k, h in enumerate(headers) if k != chosen and h["unique_name"] not in light]
+    if light and not ignore:
         raise InputError(
-            f"{path}: by its {named} the cloud gives off light of its own, which deepclouds does not render; "
+            f"{path}: by its {_named(light)} the cloud gives off light of its own, which deepclouds does not render; "
             "ignore_emission (--ignore-emission) renders what it scatters alone"
         )
-    note = f"light that the cloud gives off by its {named} is left out"
-    _LOG.info("%s: %s", path, note)
-    return (note,)
+    if light:
+        notes.append(f"light that the cloud gives off by its {_named(light)} is left out")
+    if others:
+        notes.append(f"of the file '{headers[chosen]['unique_name']}' alone is rendered, without its {_named(others)}")
+    for note in notes:
+        _LOG.info("%s: %s", path, note)
+    return tuple(notes)
+
+
+def _named(names: Sequence[str]) -> str:
+    return f"grid{'s' if len(names) > 1 else ''} {', '.join(repr(name) for name in names)}"
 
 
 def load_xml(path: Path, defines: dict[str, str]) -> Any:

@@ -41,13 +41,17 @@ def test_a_fire_is_refused_and_its_smoke_rendered_on_demand(tmp_path: Path, caps
         assert part in said
     assert not (tmp_path / "image.exr").exists()
     assert _render(fire, tmp_path, "--ignore-emission") == 0
-    assert "note: light that the cloud gives off by its grids 'temperature', 'FlameColour' is left out" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "note: light that the cloud gives off by its grids 'temperature', 'FlameColour' is left out" in said
+    assert "note: of the file 'density' alone is rendered, without its grid 'wind'" in said
     assert read_exr(tmp_path / "image.exr").channels["volume_opacity"].max() > 0
 
 
 def test_a_weather_model_is_no_fire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _render(DATA / "weather.vdb", tmp_path) == 0
-    assert "gives off" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "gives off" not in said
+    assert "note: of the file 'density' alone is rendered, without its grids 'temperature', 'heat', 'burn', 'flames'" in said
 
 
 def test_scenes_with_light_in_the_medium_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
