@@ -10,11 +10,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from deepclouds.errors import InputError
 
 NAMES = ("llvm", "cuda")
+_ALIGNMENT = 64
 _LLVM_PATTERNS = (
     "/usr/lib/*-linux-gnu/libLLVM-[0-9]*.so.1",
     "/usr/lib/*-linux-gnu/libLLVM.so.[0-9]*",
@@ -50,6 +51,22 @@ def backend(name: str = "llvm") -> ModuleType:
         )
         raise InputError(f"the Dr.Jit backend '{name}' is not available: {remedy}")
     return module
+
+
+def lanes_of(kind: Any, values: ArrayLike) -> Any:
+    """Numbers (n,) as a Dr.Jit array of the type `kind` (Float, UInt32, ...), one a lane.
+
+    Dr.Jit takes the memory of a NumPy array as it is, and compiles one kernel for memory that begins at a multiple of 64 bytes and another
+    for memory that does not, for each array that a kernel reads. NumPy's memory begins anywhere: it is copied to where it suits.
+    """
+    import drjit as dr
+
+    given = np.asarray(values, np.float32 if dr.is_float_v(kind) else np.uint32)
+    memory = np.empty(given.nbytes + _ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % _ALIGNMENT
+    aligned = memory[first : first + given.nbytes].view(given.dtype)
+    aligned[:] = given
+    return kind(aligned)
 
 
 def rows(vector: Any) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from deepclouds.backend import rows
+from deepclouds.backend import lanes_of, rows
 from deepclouds.medium.multiple_scattering import trace_walks
 from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds_runtime import stratified
@@ -91,7 +91,7 @@ class Walks:
         rays = max(walks // 2, _LEAST_RAYS)
         chosen = ((np.arange(rays) + random.random(rays)) * (width * height / rays)).astype(np.int64)
         chosen = np.minimum(chosen, width * height - 1)
-        pixel = types.UInt32(chosen.astype(np.uint32))
+        pixel = lanes_of(types.UInt32, chosen)
         one = dr.opaque(types.UInt32, 1)
         numbers = Stratified(types, pixel, dr.arange(types.UInt32, rays), one, dr.opaque(types.UInt32, key)).unrelated()
         origin, direction, end = self._rays(pixel, numbers)
@@ -151,7 +151,7 @@ class Walks:
             for k in range(_BEAMS):
                 # Roberts' sequence, shifted at random: the directions of one walk lie apart.
                 u, v = ((start[a] + k * step) % 1 for a, step in enumerate((0.7548776662466927, 0.5698402909980532)))
-                omega, density = source.sample(*(types.Float(np.minimum(t, 1 - 1e-7).astype(np.float32)) for t in (u, v)))
+                omega, density = source.sample(*(lanes_of(types.Float, np.minimum(t, 1 - 1e-7)) for t in (u, v)))
                 lanes, one = dr.arange(types.UInt32, n), dr.opaque(types.UInt32, 1)
                 numbers = Stratified(types, lanes, dr.full(types.UInt32, k, n), one, dr.opaque(types.UInt32, key)).unrelated()
                 light = source.arriving(x, omega, numbers)

@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import rows
+from deepclouds.backend import lanes_of, rows
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds_runtime.lights import Beam, LightSource, Shade
@@ -321,7 +321,7 @@ class _Predicted:
 
 def upload(types: Any, values: Array) -> Any:
     """Points (n, 3) on the device, as Array3f."""
-    return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c], np.float32)) for c in range(3)))
+    return types.Array3f(*(lanes_of(types.Float, values[:, c]) for c in range(3)))
 
 
 def _tint(lights: Sequence[Arriving]) -> Array | None:

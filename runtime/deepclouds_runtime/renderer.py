@@ -14,6 +14,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds.memory import peak_bytes
@@ -548,7 +549,7 @@ class _Work:
         origin, direction, _ = self.camera.rays(pixel, numbers)
         # What the camera sees of the surfaces, and what the middle of the cloud sees of them: the probe stands there.
         around = spread(_PILOT // 8).astype(np.float32)
-        out = types.Array3f(*(types.Float(np.ascontiguousarray(around[:, c])) for c in range(3)))
+        out = types.Array3f(*(lanes_of(types.Float, around[:, c]) for c in range(3)))
         parts = []
         for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
             _, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
@@ -563,7 +564,7 @@ class _Work:
             )
             ahead = aims - places
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
-            o, d = (types.Array3f(*(types.Float(np.ascontiguousarray(v[:, c], np.float32)) for c in range(3))) for v in (places, ahead))
+            o, d = (types.Array3f(*(lanes_of(types.Float, v[:, c]) for c in range(3))) for v in (places, ahead))
             end = dr.full(types.Float, math.inf, len(places))
             seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
@@ -578,7 +579,7 @@ class _Work:
         width, height = self.scene.size
         stride = math.ceil(math.sqrt(width * height / most))
         columns, rows = np.arange(0, width, stride), np.arange(0, height, stride)
-        pixel = self.types.UInt32((rows[:, None] * width + columns).ravel().astype(np.uint32))
+        pixel = lanes_of(self.types.UInt32, (rows[:, None] * width + columns).ravel())
         one = dr.opaque(self.types.UInt32, 1)
         return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
 
@@ -616,7 +617,9 @@ class _Work:
         clock = time.perf_counter()
         width, height = self.scene.size
         found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, (width, height), self.seed)
-        most = int(np.clip(WALKS_A_PIXEL * width * height, FEWEST, MOST)) if math.isinf(until) else MOST
+        # Walks are as noisy as any path: half of the error takes four times as many.
+        worth = WALKS_A_PIXEL * width * height * (ERROR / error) ** 2
+        most = int(np.clip(worth, FEWEST, MOST)) if math.isinf(until) else MOST
 
         def more() -> bool:
             return time.perf_counter() < until and not (interrupted is not None and interrupted())

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
+from deepclouds.backend import lanes_of
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import TAU_OPAQUE, distance_at, optical_depth
 from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
@@ -224,7 +224,7 @@ def scatter(
             counts.skipped += (len(lanes) - len(queries)) * len(different)
             j = cloud.scattering(take(points), take(w), take(omega), cloud.phase, different, take(tau))
             for c in range(channel_count):
-                value = types.Float(np.ascontiguousarray(j[:, different.index(cloud.albedo[c])]))
+                value = lanes_of(types.Float, j[:, different.index(cloud.albedo[c])])
                 value = value * (albedo[c] * albedo[c] * (0.25 / dr.pi)) * weight * take(radiance[c])
                 dr.scatter_add(result.indirect[c], value, target)
 

@@ -83,9 +83,10 @@ def test_an_interruption_leaves_an_image_of_what_there_is(renderer: Renderer, sp
 def test_an_interruption_between_passes_keeps_them(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pixels then have taken different numbers of samples, and each is divided by its own."""
     monkeypatch.setattr("deepclouds_runtime.renderer._PASS", 1000)
-    # Asked before the second round, and before each of its two passes.
-    asked = iter(range(1, 1000))
-    result = renderer.render(16, seed=3, interrupted=lambda: next(asked) >= 3)
+    # Asked before the second round, and before each of its two passes; what is asked during the prediction does not count.
+    asked, network = iter(range(1, 1000)), renderer._network
+    assert network is not None
+    result = renderer.render(16, seed=3, interrupted=lambda: network.stop is None and next(asked) >= 3)
     assert 1 < result.statistics.mean_spp < result.statistics.spp == 2
     np.testing.assert_allclose(result.rgb.mean(axis=(0, 1)), renderer.render(64, seed=3).rgb.mean(axis=(0, 1)), rtol=0.03)
     empty = result.channels["volume_opacity"] == 0
