@@ -101,7 +101,7 @@ def test_the_command_writes_every_channel_and_its_settings(folder: Path, tmp_pat
     assert np.shape(settings["camera"]["to_world"]) == (4, 4)
     assert out.with_suffix(".png").is_file()
     printed = capsys.readouterr().out
-    assert "queries" in printed
+    assert "walks" in printed
     assert "time:" in printed
 
 
