@@ -200,6 +200,8 @@ class Network(nn.Module):
             read = list(self.config.levels[first : first + self.config.together])
             each = block.stencil.in_features // len(read)
             mean, scale = (values[read].repeat_interleave(each) for values in (self.level_mean, self.level_scale))
+            # Empty space becomes 0: large products that cancel would cost digits in the thinnest places.
+            mean = mean - torch.tensor([self._empty(i) for i in read]).repeat_interleave(each)
             weight, bias = block.standardised(mean, scale)
             block.stencil.weight.copy_(weight)
             block.stencil.bias.copy_(bias)
@@ -212,7 +214,13 @@ class Network(nn.Module):
         With v = c * value, log(1 + v) is log(value + 1 / c) and the fourth root that of value + 0.05 / c, up to constants that the
         standardisation takes up: one pass less over the largest array there is.
         """
-        return self._compressed(level, self._floor(k))
+        values = self._compressed(level, self._floor(k))
+        return values - self._empty(k) if self.is_folded else values
+
+    def _empty(self, k: int) -> float:
+        """What empty space is compressed to."""
+        floor = self._floor(k)
+        return math.log(floor) if self.config.compression == "log" else (ROOT_FLOOR * floor) ** 0.25
 
     def _compressed(self, values: Tensor, floor: float | Tensor) -> Tensor:
         values = torch.clamp(values, 0.0, STENCIL_LIMIT)
@@ -252,7 +260,10 @@ class Network(nn.Module):
         read = stencil[:, even.start : even.stop : step] if tuple(even) == config.levels else stencil[:, list(config.levels)]
         # All levels in one: small networks spend their time in the number of operations.
         means = self._compressed(self.pooling(read).float(), self._floors(config.levels))
-        if not self.is_folded:
+        if self.is_folded:
+            empty = [self._empty(k) for k in config.levels]
+            means = means - (empty[0] if len(set(empty)) == 1 else torch.tensor(empty).unsqueeze(1))
+        else:
             chosen = list(config.levels)
             means = (means - self.level_mean[chosen].unsqueeze(1)) * self.level_scale[chosen].unsqueeze(1)
         n = config.together
