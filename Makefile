@@ -36,7 +36,7 @@ help:
 	echo "make card            the page about the released models, from their metadata and docs/figures"
 	echo "make bench-labels    cost of training labels beside Mitsuba's volpath"
 	echo "make labels          the labels to train on and those to judge by; run again after an interruption, it goes on"
-	echo "make train-model     labels, training and export of the model; run again after an interruption, it goes on"
+	echo "make train-model     labels, training, export and calibration of both models; run again after an interruption, it goes on"
 	echo "make setup           the installation alone; setup-test, setup-bench, setup-train add their packages"
 	echo "make clean           remove .venv and build"
 
@@ -67,9 +67,14 @@ generate = parts=$$(nproc); running=""; \
 # Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
 	$(call generate,configs/labels.toml -o work/labels)
-	if [ -e work/wide_run/checkpoint.pt ]; then how=--resume; else how=configs/wide.toml; fi; \
-	  $(BIN)/deepclouds train $$how -o work/wide_run
-	$(BIN)/deepclouds export work/wide_run -o work/wide.onnx
+	$(call generate,configs/valid_halves_labels.toml -o work/valid_halves)
+	if [ -e work/accurate_run/checkpoint.pt ]; then how=--resume; else how=configs/accurate.toml; fi; \
+	  $(BIN)/deepclouds train $$how -o work/accurate_run
+	$(BIN)/deepclouds export work/accurate_run -o work/accurate.onnx
+	$(BIN)/deepclouds export work/accurate_run --companion -o work/fast.onnx
+	for model in accurate fast; do \
+	  $(BIN)/deepclouds calibrate work/$$model.onnx --data work/labels --labels work/valid_halves || exit; \
+	done
 
 # The training labels and the held-out ones that a model is judged by; a tenth of the latter once more by Mitsuba's volpath.
 labels: setup-train
@@ -85,7 +90,7 @@ accuracy: setup-test
 
 # Of the released models, with the figures that `make accuracy MODEL=NAME CARD=1` keeps in docs/figures.
 card: setup
-	$(BIN)/deepclouds card first wide --figures docs/figures -o docs/model_card.md
+	$(BIN)/deepclouds card accurate fast --figures docs/figures -o docs/model_card.md
 
 bench-labels: setup-test
 	$(BIN)/python -m benchmarks.labels

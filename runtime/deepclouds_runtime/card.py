@@ -30,8 +30,7 @@ _PARTS = {
 _NOISE = re.compile(r" \(noise [^)]*\)")
 _HEAD = """\
 Written by `deepclouds card` from the files' metadata and measured figures: `make card` writes it anew. `deepclouds info` prints all that a
-file says, `deepclouds verify NAME` checks what it computes on this machine. A render without `--model` takes the first of the released
-models that was trained on its medium."""
+file says, `deepclouds verify NAME` checks what it computes on this machine. A render without `--model` takes `accurate`."""
 _DATA = """\
 Labels are path-traced by `deepclouds generate` in procedural clouds ([clouds.md](clouds.md), [dataset.md](dataset.md)); no measured and no
 third-party volume was used for training."""

@@ -50,10 +50,10 @@ def _refuse(properties: Any) -> Any:
 
 
 @lru_cache(maxsize=2)
-def _predictor(model: str | None, phase: tuple[float, float, float], albedos: tuple[float, ...], size: float) -> Any:
-    from deepclouds_runtime.predictor import predictor_for
+def _predictor(model: str | None) -> Any:
+    from deepclouds_runtime.predictor import Predictor
 
-    return predictor_for(model, phase, albedos, size)
+    return Predictor(model)
 
 
 def _integrator_class(mi: Any) -> Any:
@@ -78,7 +78,6 @@ def _integrator_class(mi: Any) -> Any:
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
             """Render through the film: a tensor (h, w, channels of the film's pixel format), empty unless `develop`."""
-            from deepclouds.volume.pyramid import optical_size
             from deepclouds_runtime.renderer import Renderer
             from deepclouds_runtime.scene import read_scene
 
@@ -87,7 +86,7 @@ def _integrator_class(mi: Any) -> Any:
             needs_model = self.max_depth != 2 and not self.unbiased
             renderer = Renderer(
                 read,
-                _predictor(self.model, read.phase, read.albedo, optical_size(read.volume, read.scale)) if needs_model else None,
+                _predictor(self.model) if needs_model else None,
                 unbiased=self.unbiased,
                 exact_orders=self.exact_orders,
                 environment_directions=self.environment_directions,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
 from deepclouds.volume import read_volume
-from deepclouds.volume.pyramid import mean_extinction, optical_size, volume_frame
+from deepclouds.volume.pyramid import mean_extinction, volume_frame
 from deepclouds_runtime.volume_scene import VolumeOptions, extinction, framed_corners
 
 
@@ -33,15 +33,12 @@ class Fixed:
         (3,) world point that the cells of filter and octree are aligned to: the first key frame's centre of mass.
     corners
         (n, 3) world points that the camera frames: those of all key frames.
-    size
-        longest side of a key frame's box in mean free paths, of the largest one.
     """
 
     extinction: float
     unit: float
     origin: NDArray[np.float64]
     corners: NDArray[np.float64]
-    size: float
 
 
 def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = None, clamp: bool = False) -> Fixed:
@@ -61,7 +58,7 @@ def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = N
     InputError
         when all key frames are empty, and for what the readers refuse.
     """
-    scales, masses, means, corners, sizes = [], [], [], [], []
+    scales, masses, means, corners = [], [], [], []
     origin = None
     for file in files:
         volume = read_volume(file, grid, clamp)
@@ -74,13 +71,12 @@ def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = N
         masses.append(float(volume.stored.sum(dtype=np.float64)) * float(np.prod(volume.voxel_size)))
         means.append(mean)
         corners.append(framed_corners(volume))
-        sizes.append(optical_size(volume, 1.0))
     if origin is None:
         names = ", ".join(file.name for file in files)
         raise InputError(f"{names}: the frames that fix extinction and camera of the sequence are empty; leave empty frames out of it")
     scale = min(scales)
     mean = float(np.average(means, weights=masses)) * scale
-    return Fixed(scale, 1 / mean if mean > 0 else 1.0, origin, np.concatenate(corners), scale * max(sizes))
+    return Fixed(scale, 1 / mean if mean > 0 else 1.0, origin, np.concatenate(corners))
 
 
 def with_extinction(options: VolumeOptions, fixed: Fixed) -> VolumeOptions:

@@ -95,11 +95,9 @@ def load(
         _set_threads(threads)
     scene = _scene(source, path, dict(defines or {}), grid, clamp, ignore_emission, fixed, turn, options)
     if predictor is None and scene.max_depth != 2 and not how.get("unbiased"):
-        from deepclouds.volume.pyramid import optical_size
-        from deepclouds_runtime.predictor import predictor_for
+        from deepclouds_runtime.predictor import Predictor
 
-        size = optical_size(scene.volume, scene.scale) if fixed is None else fixed.size
-        predictor = predictor_for(None if model is None else fspath(model), scene.phase, scene.albedo, size, threads)
+        predictor = Predictor(None if model is None else fspath(model), threads)
     if fixed is not None:
         how = {"unit": fixed.unit, "origin": fixed.origin, **how}
     return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)

@@ -98,16 +98,16 @@ def predict(
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
     if predictor is None:
         name = None if model is None else fspath(model)
-        predictor = _predictor(name, (g, g2, lobe_weight), albedo, optical_size(volume, scale))
+        predictor = _predictor(name)
+        phase = (g, g2, lobe_weight)
+        if unknown := predictor.outside(phase, (albedo,), optical_size(volume, scale)):
+            _LOG.warning("the model %s was not trained for %s: J is extrapolated", predictor.path.stem, ", ".join(unknown))
     j = NetworkScattering(field, predictor)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)
 
 
 @lru_cache(maxsize=2)
-def _predictor(model: str | None, phase: tuple[float, float, float], albedo: float, size: float) -> Any:
-    from deepclouds_runtime.predictor import predictor_for
+def _predictor(model: str | None) -> Any:
+    from deepclouds_runtime.predictor import Predictor
 
-    predictor = predictor_for(model, phase, (albedo,), size)
-    if unknown := predictor.outside(phase, (albedo,), size):
-        _LOG.warning("the model %s was not trained for %s: J is extrapolated", predictor.path.stem, ", ".join(unknown))
-    return predictor
+    return Predictor(model)

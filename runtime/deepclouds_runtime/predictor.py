@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 MODELS = Path(__file__).parent / "models"
-# Released models, preferred ones first.
-RELEASED = ("first", "wide")
+# Released models, the default first.
+RELEASED = ("accurate", "fast")
 # A batch's stencils (9 kB each) and activations then fit into a core's second-level cache.
 BATCH = 512
 # Inputs that a medium fixes for all of its points.
@@ -136,35 +136,6 @@ class Predictor:
             if not low * (1 - _SLACK_SIZE) <= size <= high * (1 + _SLACK_SIZE):
                 found["size"] = f"a cloud of {size:.3g} mean free paths (trained on {low:g} to {high:g})"
         return list(found.values())
-
-
-def predictor_for(
-    model: str | Path | None, phase: tuple[float, float, float], albedos: Sequence[float], size: float, threads: int | None = None
-) -> Predictor:
-    """`model`, or, for None, the preferred one of the released models that were trained on such a medium.
-
-    Where none was, it is the one with the fewest inputs outside of its training, of equals the later one, which has seen more:
-    `Predictor.outside` says which.
-
-    Parameters
-    ----------
-    model, threads
-        as for `Predictor`.
-    phase, albedos
-        as for `Predictor.outside`.
-    size
-        longest side of the cloud's box in mean free paths, see `deepclouds.volume.pyramid.optical_size`.
-    """
-    if model is not None:
-        return Predictor(model, threads)
-    found: list[tuple[int, Predictor]] = []
-    for name in RELEASED:
-        predictor = Predictor(name, threads)
-        outside = len(predictor.outside(phase, albedos, size))
-        if outside == 0:
-            return predictor
-        found.append((outside, predictor))
-    return min(reversed(found), key=lambda pair: pair[0])[1]
 
 
 def find_model(model: str | Path | None) -> Path:

@@ -47,13 +47,3 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_record(folder, ShardInfo(index=index, file=file, family=family, split=split, count=POINTS, sha256=digest))
     write_manifest(folder, {})
     return folder
-
-
-@pytest.fixture(scope="session")
-def knowing_model() -> str:
-    """Name of a released model that knows how far it can be trusted."""
-    from deepclouds_runtime.predictor import RELEASED, Predictor
-
-    knowing = [name for name in RELEASED if Predictor(name, threads=1).metadata.trust is not None]
-    assert knowing, "`deepclouds calibrate` tells the released models how far they can be trusted"
-    return knowing[0]

@@ -183,10 +183,10 @@ def test_tenths_find_an_error_that_is_known() -> None:
     assert rise(tenths(judged, expected, judged.distance)) == pytest.approx(1, abs=0.1)
 
 
-def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixture[str], llvm_mitsuba: object, knowing_model: str) -> None:
+def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixture[str], llvm_mitsuba: object) -> None:
     """Expected behaviour: very little of every part is measured, written and drawn, and the last line sums it up."""
     where = ["--labels", str(small_dataset), "--out", str(tmp_path)]
-    assert accuracy.main(["--quick", "--only", "ball_isotropic", "--model", knowing_model, *where]) == 0
+    assert accuracy.main(["--quick", "--only", "ball_isotropic", *where]) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     number = r"[+-]?\d+\.\d+"
     last = f"accuracy: worst rRMSE {number} %, worst energy {number} %, furnace rms {number} %, slab error {number}"

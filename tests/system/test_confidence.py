@@ -175,10 +175,10 @@ def test_extrapolating_takes_a_word(cloud: Path) -> None:
 
 
 def test_the_command_writes_the_channel_and_traces_what_is_unknown(
-    cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], knowing_model: str
+    cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "image.exr"
-    fixed = ["render", str(cloud), "-o", str(out), "--size", "24x18", "--spp", "1", "--model", knowing_model]
+    fixed = ["render", str(cloud), "-o", str(out), "--size", "24x18", "--spp", "1"]
     assert main(fixed) == 0
     assert "error of the network, expected" in capsys.readouterr().out
     trusted = read_exr(out).channels["confidence"]

@@ -11,7 +11,7 @@ import onnx
 import pytest
 import torch
 from deepclouds_runtime import predictor
-from deepclouds_runtime.predictor import BATCH, Predictor, find_model, predictor_for
+from deepclouds_runtime.predictor import BATCH, RELEASED, Predictor, find_model
 from deepclouds_training.export import TOLERANCE, export_network, seeded_samples
 from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.trainer import predict
@@ -149,18 +149,24 @@ def test_names_mean_released_models_and_paths_mean_files(model: Path, monkeypatc
         find_model("./small")
 
 
-def test_a_medium_gets_the_released_model_that_was_trained_on_it() -> None:
-    """One lobe is the business of the first model, two lobes and large clouds that of the second; so is what neither knows."""
-    one, two, both = (0.85, 0.0, 1.0), (0.85, -0.3, 0.8), (0.99, -0.3, 0.8)
-    cases = [(one, 100.0, "first"), (two, 100.0, "wide"), (one, 1000.0, "wide"), (both, 100.0, "wide"), (one, 5000.0, "wide")]
-    for phase, size, name in cases:
-        assert predictor_for(None, phase, (1.0, 0.9), size).path.stem == name, (phase, size)
-    first, wide = Predictor("first"), Predictor("wide")
-    assert first.outside(one, (1.0, 0.9)) == wide.outside(two, (1.0, 0.9)) == []
-    (said,) = wide.outside(both, (1.0,))
+@pytest.mark.parametrize("name", RELEASED)
+def test_a_released_model_knows_what_it_was_trained_on(name: str) -> None:
+    model = Predictor(name)
+    assert model.path.stem == model.metadata.name == name
+    for phase in ((0.85, 0.0, 1.0), (0.85, -0.3, 0.8), (-0.3, 0.85, 0.2), (0.0, 0.0, 1.0)):
+        assert model.outside(phase, (1.0, 0.9), 1000.0) == [], phase
+    (said,) = model.outside((0.99, -0.3, 0.8), (1.0,), 100.0)
     assert said.startswith("g1 = 0.99 (trained on -0.")
-    assert wide.outside((-0.3, 0.85, 0.2), (1.0,)) == []
-    assert predictor_for("wide", one, (1.0,), 100.0).path.stem == "wide"
+    (said,) = model.outside((0.85, 0.0, 1.0), (1.0,), 5000.0)
+    assert said.startswith("a cloud of 5e+03 mean free paths")
+    assert model.metadata.trust is not None
+
+
+def test_the_accurate_model_is_the_default_and_the_fast_one_is_small() -> None:
+    assert Predictor(None).path.stem == "accurate"
+    sizes = [sum(np.prod(i.dims) for i in onnx.load(predictor.MODELS / f"{name}.onnx").graph.initializer) for name in RELEASED]
+    assert sizes[0] <= 1_500_000
+    assert sizes[1] <= 60_000
 
 
 def test_predicting_never_loads_torch(model: Path) -> None:
