@@ -2,11 +2,12 @@
 
     python -m benchmarks.inference [--models name,...] [--threads N] [--quick] [--docs]
 
-The peak is that of large matrix products by the library that runs the network, onnxruntime, with as many threads. Rates of the network are
-those of its file at each of several batches, stencils given; `as rendered` is what `Predictor.predict` reaches with its fixed batch. A
-multiply-add counts as two operations; those of a query are counted in the file's graph: matrix products alone. All of it is measured in
-turns, several rounds in one run, and of each the quickest round counts, since other work on the machine only adds. Shares of the peak are
-given twice: of the seconds that pass, which is what users wait for, and of the processor's, which hold on a busy machine too.
+The peak is that of large matrix products by the library that runs the network, onnxruntime, with as many threads. Rates of the network
+are those of its file at each of several batches, one on each thread, stencils given; `as rendered` is what `Predictor.predict` reaches
+with its fixed batch. A multiply-add counts as two operations; those of a query are counted in the file's graph: matrix products alone.
+All of it is measured in turns, several rounds in one run, and of each the quickest round counts, since other work on the machine only
+adds. Shares of the peak are given twice: of the seconds that pass, which is what users wait for, and of the processor's, which hold on a
+busy machine too.
 
 Last line: `inference: N % of the measured peak, N % by processor time`, of the first model.
 """
@@ -20,6 +21,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,7 +105,7 @@ def quickest(works: Sequence[Callable[[], object]], rounds: int, least_seconds: 
 
 
 def session(model: bytes, threads: int) -> Any:
-    """The network as the product runs it."""
+    """The network, or a product."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -138,10 +140,12 @@ def measure(models: Sequence[str], threads: int, batches: Sequence[int], sides: 
     """Rates of matrix products, and of each model at every batch and as rendered."""
     works: list[tuple[str, str, int, int]] = []
     calls: list[Callable[[], object]] = []
+    batches_a_call: list[int] = []
 
-    def add(what: str, model: str, batch: int, cost: int, call: Callable[[], object]) -> None:
+    def add(what: str, model: str, batch: int, cost: int, call: Callable[[], object], count: int = 1) -> None:
         works.append((what, model, batch, cost))
         calls.append(call)
+        batches_a_call.append(count)
 
     for side in sides:
         product = session(matrix_product(side).SerializeToString(), threads)
@@ -150,14 +154,21 @@ def measure(models: Sequence[str], threads: int, batches: Sequence[int], sides: 
     for name in models:
         predictor = Predictor(name, threads)
         data = predictor.path.read_bytes()
-        cost, network = multiply_adds(data), session(data, threads)
+        cost, network, pool = multiply_adds(data), session(data, 1), ThreadPoolExecutor(threads)
         for batch in batches:
-            stencil, aux = queries(batch)
-            feed = {INPUT_STENCIL: stencil, INPUT_AUX: aux}
-            add("network", model_name(name), batch, cost, lambda run=network.run, feed=feed: run([OUTPUT], feed))  # type: ignore[misc]
+            feeds = []
+            for seed in range(threads):
+                stencil, aux = queries(batch, seed)
+                feeds.append({INPUT_STENCIL: stencil, INPUT_AUX: aux})
+
+            def run(run: Any = network.run, pool: ThreadPoolExecutor = pool, feeds: list[Any] = feeds) -> object:
+                return list(pool.map(lambda feed: run([OUTPUT], feed), feeds))
+
+            add("network", model_name(name), batch, cost, run, threads)
         many = queries(4 * BATCH)
         add("rendered", model_name(name), 4 * BATCH, cost, lambda p=predictor, many=many: p.predict(*many))  # type: ignore[misc]
-    return [Rate(*work, *spent) for work, spent in zip(works, quickest(calls, rounds, turn), strict=True)]
+    measured = zip(works, quickest(calls, rounds, turn), batches_a_call, strict=True)
+    return [Rate(*work, *(seconds / count for seconds in spent)) for work, spent, count in measured]
 
 
 def peak(rates: Sequence[Rate]) -> Rate:

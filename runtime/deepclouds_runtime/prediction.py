@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from deepclouds.volume import Volume
+    from deepclouds_runtime.predictor import Predictor
     from deepclouds_runtime.scattering import Predicts
 
 _LOG = logging.getLogger(__name__)
@@ -98,16 +99,15 @@ def predict(
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
     if predictor is None:
         name = None if model is None else fspath(model)
-        predictor = _predictor(name)
-        phase = (g, g2, lobe_weight)
-        if unknown := predictor.outside(phase, (albedo,), optical_size(volume, scale)):
-            _LOG.warning("the model %s was not trained for %s: J is extrapolated", predictor.path.stem, ", ".join(unknown))
+        released = predictor = _predictor(name)
+        if unknown := released.outside((g, g2, lobe_weight), (albedo,), optical_size(volume, scale)):
+            _LOG.warning("the model %s was not trained for %s: J is extrapolated", released.path.stem, ", ".join(unknown))
     j = NetworkScattering(field, predictor)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)
 
 
 @lru_cache(maxsize=2)
-def _predictor(model: str | None) -> Any:
+def _predictor(model: str | None) -> Predictor:
     from deepclouds_runtime.predictor import Predictor
 
     return Predictor(model)

@@ -1,9 +1,10 @@
-"""Predictions of a model file: checked when it is loaded, run by onnxruntime in batches that stay in the cache."""
+"""Predictions of a model file: checked when it is loaded, run by onnxruntime in batches that stay in the cache, one a thread."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +61,9 @@ class Predictor:
         data = _read(self.path)
         proto = _parse(data, self.path)
         self.metadata = _checked_metadata(proto, self.path)
-        self._session = _session(data, self.path, threads or os.cpu_count() or 1)
+        self._session = _session(data, self.path)
+        # Several threads in one small product wait for each other most of the time; each has a batch of its own.
+        self._threads = ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="predictor")
 
     def predict(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
         """Predict j (n,) for stencils (n, 10, 225) and aux rows (n, 6), both float32 as the contract orders them.
@@ -75,9 +78,13 @@ class Predictor:
         if stencil.shape != (n, LEVELS, POINTS) or aux.shape != (n, len(AUX)):
             raise ValueError(f"expected (n, {LEVELS}, {POINTS}) and (n, {len(AUX)}), got {stencil.shape} and {aux.shape}")
         j = np.empty(n, np.float32)
-        for start in range(0, n, BATCH):
+
+        def run(start: int) -> None:
             rows = slice(start, start + BATCH)
             j[rows] = self._session.run([OUTPUT], {INPUT_STENCIL: stencil[rows], INPUT_AUX: aux[rows]})[0]
+
+        for _ in self._threads.map(run, range(0, n, BATCH)):
+            pass
         # The graph clamps its inputs, so only NaN gets through, from an input to the output or out of damaged weights.
         if not np.all(np.isfinite(j)):
             bad = np.count_nonzero(~np.isfinite(j))
@@ -197,15 +204,13 @@ def _checked_metadata(model: ModelProto, path: Path) -> ModelMetadata:
     return metadata
 
 
-def _session(data: bytes, path: Path, threads: int) -> Any:
+def _session(data: bytes, path: Path) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    # Tracing and prediction alternate: threads that spin while they wait for the next batch would take the tracer's processors.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:
