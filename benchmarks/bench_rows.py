@@ -20,6 +20,8 @@ _LABELS = {
     "single": "single scattering",
 }
 # What the modes of deepclouds add to the model's name.
+# The fast mode, what `deepclouds render` does by itself first.
+FAST = ("corrected", "deepclouds")
 _MODES = {"deepclouds": "", "corrected": ", corrected", "reference": ", every sample asks"}
 
 
@@ -55,18 +57,22 @@ def label(method: str, model: str = "") -> str:
 
 def models(rows: Sequence[Row], scene: str | None = None) -> list[str]:
     """Models that deepclouds was run with in its fast mode, in a scene or in any, the first one first."""
-    return list(dict.fromkeys(r.model for r in rows if r.method == "deepclouds" and scene in (None, r.scene)))
+    return list(dict.fromkeys(r.model for r in rows if r.method in FAST and scene in (None, r.scene)))
 
 
-def compared(rows: Sequence[Row], scene: str, model: str | None = None) -> Row | None:
+def compared(rows: Sequence[Row], scene: str, model: str | None = None, method: str | None = None) -> Row | None:
     """The row of deepclouds that is held against its peers: that with its own choice of samples, else the one with most.
 
     Parameters
     ----------
     model
         which one; by default the scene's first. None is returned where it was not run.
+    method
+        corrected or not; by default corrected, as `deepclouds render` does it, where that was run.
     """
-    candidates = [r for r in rows if (r.scene, r.method) == (scene, "deepclouds")]
+    if method is None:
+        return next(filter(None, (compared(rows, scene, model, each) for each in FAST)), None)
+    candidates = [r for r in rows if (r.scene, r.method) == (scene, method)]
     if model is None and candidates:
         model = candidates[0].model
     candidates = [r for r in candidates if r.model == model]
@@ -87,13 +93,13 @@ def equal_error(rows: Sequence[Row], ours: Row, error: float | None = None) -> d
 
 
 def speed_ups(rows: Sequence[Row]) -> list[str]:
-    """One line a scene and model: deepclouds' time and error, what its peers need to the same error, and the ratios.
+    """One line a scene, model and mode: deepclouds' time and error, what its peers need to the same error, and the ratios.
 
     The range in brackets is the ratio at both ends of the interval of deepclouds' error.
     """
     lines = []
     for scene in dict.fromkeys(r.scene for r in rows):
-        found = [compared(rows, scene, model) for model in models(rows, scene)]
+        found = [compared(rows, scene, model, method) for model in models(rows, scene) for method in reversed(FAST)]
         if not any(found):
             lines.append(f"{scene}: no speed-up, deepclouds was not run")
         for ours in found:
@@ -111,7 +117,7 @@ def speed_ups(rows: Sequence[Row]) -> list[str]:
 
 
 def medians(rows: Sequence[Row], kinds: Mapping[str, str], model: str | None = None) -> str:
-    """Medians over scenes of the speed-up at equal error, under suns alone and under an environment.
+    """Medians over scenes of the speed-up at equal error, under suns alone and under an environment; corrected, where that was run.
 
     Parameters
     ----------

@@ -322,21 +322,23 @@ def test_each_model_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 
 def test_models_are_told_apart(tmp_path: Path) -> None:
     rows = [row("volpath", 16, 2.0, 0.4), row("deepclouds", 0, 0.5, 0.1, "a"), row("deepclouds", 4, 0.6, 0.1, "b")]
-    rows += [row("corrected", 0, 2.0, 0.05, "a"), row("deepclouds", 0, 1.0, 0.1, "b", "t"), row("volpath", 16, 2.0, 0.4, scene="t")]
+    rows += [row("corrected", 0, 4.0, 0.05, "a"), row("deepclouds", 0, 1.0, 0.1, "b", "t"), row("volpath", 16, 2.0, 0.4, scene="t")]
     assert models(rows) == ["a", "b"]
     assert models(rows, "t") == ["b"]
-    assert compared(rows, "s") is rows[1]
+    assert compared(rows, "s") is rows[3]
+    assert compared(rows, "s", "a", "deepclouds") is rows[1]
     assert compared(rows, "s", "b") is rows[2]
     assert compared(rows, "t", "a") is None
-    first, second, third = speed_ups(rows)
+    first, corrected, second, third = speed_ups(rows)
     assert first.startswith("s: deepclouds a reaches 10.00 % in 0.5 s; at equal error 64 x")
+    assert corrected.startswith("s: deepclouds a, corrected reaches 5.00 % in 4 s; at equal error 32 x")
     assert second.startswith("s: deepclouds b reaches 10.00 % in 0.6 s")
     assert third.startswith("t: deepclouds b")
     table = markdown(rows)
     assert "| deepclouds a, corrected | default |" in table
     kinds = {"s": "sun", "t": "environment"}
-    assert medians(rows, kinds) == "speed: sun 64 x volpath, unknown x volpath+OIDN; environment 32 x volpath"
-    assert medians(rows, kinds, "a") == "a, speed: sun 64 x volpath, unknown x volpath+OIDN; environment unknown x volpath"
+    assert medians(rows, kinds) == "speed: sun 32 x volpath, unknown x volpath+OIDN; environment 32 x volpath"
+    assert medians(rows, kinds, "a") == "a, speed: sun 32 x volpath, unknown x volpath+OIDN; environment unknown x volpath"
     write_csv(tmp_path / "bench.csv", rows)
     with open(tmp_path / "bench.csv", newline="", encoding="utf-8") as file:
         assert [r["model"] for r in csv.DictReader(file)] == ["", "a", "b", "a", "b", ""]

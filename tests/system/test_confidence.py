@@ -174,9 +174,7 @@ def test_extrapolating_takes_a_word(cloud: Path) -> None:
     assert load(cloud, predictor=Doubting(0.1, 0.1, unknown=("something",)), extrapolate=True, **SUN).model_hash == "e" * 64
 
 
-def test_the_command_writes_the_channel_and_traces_what_is_unknown(
-    cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_the_channel_and_traces_what_is_unknown(cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "image.exr"
     fixed = ["render", str(cloud), "-o", str(out), "--size", "24x18", "--spp", "1"]
     assert main(fixed) == 0
