@@ -7,7 +7,8 @@ product is its variance (Wiener's filter). A level at which they do not agree is
 but a finer one. With more walks everything is taken in, down to the finest lattice.
 
 The noise of a node is that of its walks in number, at the variance of the walks in a wide neighbourhood. Its own walks may not tell it: the
-rare ones that find much light would be believed less for it, and the sum would be too dark.
+rare ones that find much light would be believed less for it, and the sum would be too dark. What is left of that is kept out of the image's
+sum by finer levels that have none: only the single number changes it.
 """
 
 from __future__ import annotations
@@ -117,6 +118,10 @@ class Correction:
                 values[:, c] = _shrunken(left, below, _at_nodes(variance[c], index, np.square(tent), count))
             if not values.any():
                 continue
+            if level >= 0:
+                # What the image is brighter or darker as a whole, the single number knows best: a finer level only moves light about.
+                moved, total = np.einsum("mk,mkc->cm", tent, values[index]), scale[0] + scale[1]
+                values -= (moved * total).sum(axis=1) / np.maximum(total.sum(axis=1), 1e-300)
             field = field + values.reshape(field.shape)
             flat = field.reshape(count, channels)
             known = np.einsum("mk,mkc->cm", tent, flat[index])
