@@ -90,7 +90,7 @@ CASES: dict[str, Case] = {
     ),
     "sphere": Case(_sphere, 12.0, _sun("-0.3, -0.9, -0.3"), "2.5, 0.8, 3.4"),
     "shadow of a cloud": Case(_two_clouds, 60.0, _sun("-1, -0.05, -0.03"), "-1.2, 0.4, 4.2", target="-0.66, 0, 0", fov=11),
-    "smoke, coloured": Case(lambda: _box(plume()), 10.0, _sun("-0.5, -0.7, -0.6"), "0, 0, 4.3", fov=28, albedo="0.99 0.92 0.8", g=0.6),
+    "coloured smoke": Case(lambda: _box(plume()), 10.0, _sun("-0.5, -0.7, -0.6"), "0, 0, 4.3", fov=28, albedo="0.99 0.92 0.8", g=0.6),
     "cumulus under a sky": Case(lambda: make_cloud("cumulus", 9203, 96), 40.0, _SKY, "0.6, -0.2, 4.6", fov=27),
     "heap over a floor": Case(lambda: _box(heap()), 12.0, _sun("-0.5, -1, -0.4") + _FLOOR, "1, 0.8, 4.6", target="0, -0.2, 0", g=0.7),
 }
@@ -175,4 +175,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        raise SystemExit(main())
+    except InputError as error:
+        print(f"benchmarks.audited: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
