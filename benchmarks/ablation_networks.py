@@ -102,6 +102,10 @@ class PooledAtOnce(Network):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
 
+    def folded(self) -> Network:
+        """There are no blocks whose weights could take up the standardisation."""
+        return self
+
     def through(self, level: Callable[[int], Tensor], f: Tensor, plain: bool) -> Tensor:
         """A layer, a residual layer and another layer."""
         o = F.relu(self.entry(torch.cat([*(level(k) for k in self.sequence), f], dim=1)))

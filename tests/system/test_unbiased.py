@@ -44,7 +44,6 @@ def renderer(cloud: Path, monkeypatch: pytest.MonkeyPatch) -> Renderer:
     def refused(*arguments: object) -> None:
         raise AssertionError("no network is needed")
 
-    monkeypatch.setattr(deepclouds_runtime.predictor, "predictor_for", refused)
     monkeypatch.setattr(deepclouds_runtime.predictor, "Predictor", refused)
     return load(cloud, **HOW)
 
