@@ -181,7 +181,10 @@ def test_a_second_signal_ends_at_once(root: Path, tmp_path: Path) -> None:
             process.send_signal(signal.SIGINT)
             time.sleep(0.02)
         _, said = process.communicate(timeout=240)
-    assert process.returncode == 130, said
+    # The first signal may be done with, image and all, before the second one comes: that one ends a program on its way out,
+    # which a shell calls 130 too.
+    late = "interrupted: wrote" in said and process.returncode == -signal.SIGINT
+    assert process.returncode == 130 or late, said
     assert said.rstrip().endswith("interrupted") or "interrupted: wrote" in said
     assert "Traceback" not in said
     assert [p.name for p in tmp_path.iterdir()] == ["out.exr"]
