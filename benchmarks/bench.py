@@ -3,10 +3,10 @@
     python -m benchmarks.bench [--scenes DIR] [--size 96] [--only name,...] [--out out/bench] [--quick] [--docs]
 
 A folder of scenes holds `<name>/scene.xml` (parameters integrator and size), `ref_a.exr` and `ref_b.exr`. Each method runs in a process
-of its own, one after the other, and deepclouds once with each released model that was trained on the scene's medium: first the one that
-it takes by itself. Writes `bench.csv`, a plot of time against error a scene and `bench.md`; the last lines printed are the speed-up of
-deepclouds at equal error, scene by scene, and the medians of the scenes under suns alone and of those under an environment: of each model,
-and in the last line of the models that it takes by itself.
+of its own, one after the other, and deepclouds once with each released model that was trained on the scene's medium, the default first.
+Writes `bench.csv`, a plot of time against error a scene and `bench.md`; the last lines printed are the speed-up of deepclouds at equal
+error, scene by scene, and the medians of the scenes under suns alone and of those under an environment: of each model, and in the last
+line of the first.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run on every scene: methods, models for those that ask one (None: deepclouds' own choice), and samples a pixel of
-    deepclouds and, at the references' size, of its peers; the first seed; the folder of images.
+    """What is run on every scene: methods, models for those that ask one, and samples a pixel of deepclouds and, at the references' size,
+    of its peers; the first seed; the folder of images.
     """
 
     methods: Sequence[str]
-    models: Sequence[str | None]
+    models: Sequence[str]
     ours: Sequence[int]
     peers: Sequence[int]
     seed: int
@@ -69,8 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--ours", help="spp of deepclouds, 0 for its own choice (default 0,1,4,16; with --quick 0)")
     parser.add_argument(
         "--models",
-        help="comma-separated names or files of models; by default the one that deepclouds takes by itself, then the other released ones "
-        f"({', '.join(RELEASED)}; with --quick the former alone)",
+        help=f"comma-separated names or files of models (default {','.join(RELEASED)}; with --quick the first)",
     )
     parser.add_argument("--seed", type=int, default=7, help="first seed (default %(default)s); share none with the references")
     parser.add_argument("--out", type=Path, default=Path("out/bench"), help="folder for images, table and plots (default %(default)s)")
@@ -85,11 +84,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # The denoised run holds the noisy images too: tracing them twice would only cost time.
     if "oidn" in methods and "volpath" in methods:
         methods.remove("volpath")
-    asked: list[str | None] = [None] if options.quick else [None, *RELEASED]
-    if options.models:
-        asked = [*options.models.split(",")]
-        for model in asked:
-            find_model(model)
+    asked = options.models.split(",") if options.models else RELEASED[:1] if options.quick else RELEASED
+    for model in asked:
+        find_model(model)
     plan = Plan(
         methods,
         asked,
@@ -132,11 +129,8 @@ def measure(
     # Octaves have no choice of their own.
     spps = {"deepclouds": plan.ours, "corrected": [DEFAULT_SPP], "octaves": [n for n in plan.ours if n != DEFAULT_SPP] or [4]}
     for method in plan.methods:
-        measured: list[str] = []
         for model in plan.models if method in OURS else [None]:
             name = "" if model is None else model_name(model)
-            if name in measured:
-                continue
             folder = plan.out / scene.name / name
             problem = run_worker(method, scene / "scene.xml", size, spps.get(method, spread), plan.seed, folder, model)
             if problem is not None:
@@ -151,7 +145,6 @@ def measure(
                 report = error_report(image, *references, flip=find_spec("flip_evaluator") is not None)
                 seconds = entry["seconds_warm"], entry["seconds_cold"]
                 rows.append(Row(entry["method"], scene.name, entry["spp"], *seconds, report, entry["model"]))
-                measured.append(entry["model"])
                 print(_line(rows[-1]), flush=True)
 
 

@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,11 @@ def queries(count: int, seed: int = 0) -> tuple[NDArray[np.float32], NDArray[np.
     return rng.uniform(0, 0.1, (count, LEVELS, POINTS)).astype(np.float32), aux
 
 
+def at_once(pool: ThreadPoolExecutor, ask: Callable[[Any], object], feeds: Sequence[dict[str, Any]]) -> list[object]:
+    """Answers to several batches, one on each thread."""
+    return list(pool.map(ask, feeds))
+
+
 def measure(models: Sequence[str], threads: int, batches: Sequence[int], sides: Sequence[int], rounds: int, turn: float) -> list[Rate]:
     """Rates of matrix products, and of each model at every batch and as rendered."""
     works: list[tuple[str, str, int, int]] = []
@@ -150,23 +156,19 @@ def measure(models: Sequence[str], threads: int, batches: Sequence[int], sides: 
     for side in sides:
         product = session(matrix_product(side).SerializeToString(), threads)
         rows = np.random.default_rng(side).standard_normal((side, side)).astype(np.float32)
-        add("matmul", "", side, side * side, lambda run=product.run, rows=rows: run(None, {"rows": rows}))  # type: ignore[misc]
+        add("matmul", "", side, side * side, partial(product.run, None, {"rows": rows}))
     for name in models:
         predictor = Predictor(name, threads)
         data = predictor.path.read_bytes()
-        cost, network, pool = multiply_adds(data), session(data, 1), ThreadPoolExecutor(threads)
+        cost, pool, ask = multiply_adds(data), ThreadPoolExecutor(threads), partial(session(data, 1).run, [OUTPUT])
         for batch in batches:
             feeds = []
             for seed in range(threads):
                 stencil, aux = queries(batch, seed)
                 feeds.append({INPUT_STENCIL: stencil, INPUT_AUX: aux})
-
-            def run(run: Any = network.run, pool: ThreadPoolExecutor = pool, feeds: list[Any] = feeds) -> object:
-                return list(pool.map(lambda feed: run([OUTPUT], feed), feeds))
-
-            add("network", model_name(name), batch, cost, run, threads)
+            add("network", model_name(name), batch, cost, partial(at_once, pool, ask, feeds), threads)
         many = queries(4 * BATCH)
-        add("rendered", model_name(name), 4 * BATCH, cost, lambda p=predictor, many=many: p.predict(*many))  # type: ignore[misc]
+        add("rendered", model_name(name), 4 * BATCH, cost, partial(predictor.predict, *many))
     measured = zip(works, quickest(calls, rounds, turn), batches_a_call, strict=True)
     return [Rate(*work, *(seconds / count for seconds in spent)) for work, spent, count in measured]
 

@@ -35,6 +35,8 @@ from deepclouds_runtime.stratified import Stratified
 from numpy.typing import NDArray
 
 from benchmarks.page import write_results
+from deepclouds.backend import rows
+from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
 from deepclouds.medium.multiple_scattering import trace_walks
@@ -72,7 +74,7 @@ def seen(sun: tuple[float, float], rays: int, seed: int) -> View:
     pixel, one = dr.arange(types.UInt32, side * side), dr.opaque(types.UInt32, 1)
     numbers = Stratified(types, pixel, dr.zeros(types.UInt32, side * side), one, dr.opaque(types.UInt32, seed))
     origin, direction, _ = Camera(types, scene.sensor).rays(pixel, numbers)
-    o, d = (np.ascontiguousarray(np.broadcast_to(np.array(v).T, (side * side, 3)), np.float32) for v in (origin, direction))
+    o, d = (np.broadcast_to(rows(v), (side * side, 3)) for v in (origin, direction))
     points, hit = first_collisions(field, o, d, seed)
     return View(field, NetworkScattering(field, renderer.predictor), scene.suns[0], scene.phase, points[hit], d[hit])
 
@@ -83,7 +85,7 @@ def drawn(disc: Sun, n: int, random: np.random.Generator) -> NDArray[np.float32]
     around = (random.random((n, 1)) + np.arange(_DRAWN) / _DRAWN) % 1
     u, v = (types.Float(np.minimum(t.ravel(), 1 - 1e-7).astype(np.float32)) for t in (np.repeat(random.random(n), _DRAWN), around))
     omega, _ = Disc(types, disc, Shade(types, None)).sample(u, v)
-    return np.array(omega, np.float32).T.reshape(n, _DRAWN, 3)
+    return rows(omega).reshape(n, _DRAWN, 3)
 
 
 Halves = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -148,22 +150,28 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--walks", type=int, default=128, help="walks a point (default %(default)s)")
     parser.add_argument("--docs", action="store_true", help=f"write the table into {PAGE.name}")
     arguments = parser.parse_args(argv)
-    rows = [
+    table = [
         "| sun | its diameter | walks: a point % | energy % | network: a point % | energy % |",
         "|---|---|---|---|---|---|",
     ]
     for name, sun in SUNS.items():
         view = seen(sun, arguments.rays, 1)
+        if len(view.points) < _GROUPS:
+            raise InputError(f"--rays {arguments.rays}: {len(view.points)} of them meet the cloud, at least {_GROUPS} must; give more")
         for diameter in DIAMETERS:
             clock, random = time.process_time(), np.random.default_rng(2)
             disc = replace(view.sun, radius=math.radians(diameter / 2))
             found = [left_out(*by_walks(view, disc, arguments.walks, random)), left_out(*by_network(view, disc, random))]
-            rows.append(f"| {name} | {diameter:g} | {' | '.join(found)} |")
-            print(f"{rows[-1]} {time.process_time() - clock:.1f} s", flush=True)
+            table.append(f"| {name} | {diameter:g} | {' | '.join(found)} |")
+            print(f"{table[-1]} {time.process_time() - clock:.1f} s", flush=True)
     if arguments.docs:
-        write_results(PAGE, "benchmarks.sun_disc", "\n".join(rows))
+        write_results(PAGE, "benchmarks.sun_disc", "\n".join(table))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        raise SystemExit(main(sys.argv[1:]))
+    except InputError as error:
+        print(f"benchmarks.sun_disc: {error}", file=sys.stderr)
+        raise SystemExit(2) from None

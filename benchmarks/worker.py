@@ -5,7 +5,7 @@
 METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), reference (its method as published: every sample
 asks the network), unbiased (its own path tracer), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its denoised image) or single
 (single scattering). Writes one EXR an image and `METHOD.json`: for each image its method, model, spp, file, seconds warm and seconds cold;
-nothing for a model that was asked for by name and was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all
+nothing for a model that was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all
 work that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and loading included.
 """
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, required=True)
     parser.add_argument("--spp", required=True, help="comma-separated; 0: the renderer's own default (deepclouds only)")
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--model", help="deepclouds: name or file of a model (default: its own choice)")
+    parser.add_argument("--model", help="deepclouds: name or file of a model (default: the one that it takes by itself)")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(argv)
     spps = [int(s) for s in options.spp.split(",")]
@@ -70,9 +70,9 @@ def render_deepclouds(
     name = ""
     if method != "unbiased":
         # Without weights, paths are traced in the network's place.
-        if renderer.model_hash is None and model is not None:
+        if renderer.model_hash is None:
             return []
-        name = "walks" if renderer.model_hash is None else renderer.predictor.path.stem
+        name = renderer.predictor.path.stem
 
     def render(spp: int, seed: int) -> Image:
         result = renderer.render(None if spp == DEFAULT_SPP else spp, seed, correct=method == "corrected")

@@ -22,7 +22,6 @@ and other pixel filters than `box` are replaced by it.
 from __future__ import annotations
 
 import time
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -49,13 +48,6 @@ def _refuse(properties: Any) -> Any:
     raise InputError(f"the integrator '{NAME}' does not run in Mitsuba's variant '{mi.variant()}'; choose one of {', '.join(VARIANTS)}")
 
 
-@lru_cache(maxsize=2)
-def _predictor(model: str | None) -> Any:
-    from deepclouds_runtime.predictor import Predictor
-
-    return Predictor(model)
-
-
 def _integrator_class(mi: Any) -> Any:
     # Each variant has base classes of its own, so the class is made anew for each.
     class DeepCloudsIntegrator(mi.SamplingIntegrator):  # type: ignore[misc]
@@ -78,6 +70,7 @@ def _integrator_class(mi: Any) -> Any:
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True) -> Any:
             """Render through the film: a tensor (h, w, channels of the film's pixel format), empty unless `develop`."""
+            from deepclouds_runtime.predictor import kept
             from deepclouds_runtime.renderer import Renderer
             from deepclouds_runtime.scene import read_scene
 
@@ -86,7 +79,7 @@ def _integrator_class(mi: Any) -> Any:
             needs_model = self.max_depth != 2 and not self.unbiased
             renderer = Renderer(
                 read,
-                _predictor(self.model) if needs_model else None,
+                kept(self.model) if needs_model else None,
                 unbiased=self.unbiased,
                 exact_orders=self.exact_orders,
                 environment_directions=self.environment_directions,

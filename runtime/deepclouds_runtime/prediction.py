@@ -99,15 +99,17 @@ def predict(
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
     if predictor is None:
         name = None if model is None else fspath(model)
-        released = predictor = _predictor(name)
-        if unknown := released.outside((g, g2, lobe_weight), (albedo,), optical_size(volume, scale)):
-            _LOG.warning("the model %s was not trained for %s: J is extrapolated", released.path.stem, ", ".join(unknown))
+        predictor = _warned(name, (g, g2, lobe_weight), albedo, optical_size(volume, scale))
     j = NetworkScattering(field, predictor)(p, d, s, (g, g2, lobe_weight), (albedo,), tau)
     return multiple_scattering(j[:, 0], albedo)
 
 
 @lru_cache(maxsize=2)
-def _predictor(model: str | None) -> Predictor:
-    from deepclouds_runtime.predictor import Predictor
+def _warned(model: str | None, phase: tuple[float, float, float], albedo: float, size: float) -> Predictor:
+    """The model; says once of a medium that it was not trained for it."""
+    from deepclouds_runtime.predictor import kept
 
-    return Predictor(model)
+    predictor = kept(model)
+    if unknown := predictor.outside(phase, (albedo,), size):
+        _LOG.warning("the model %s was not trained for %s: J is extrapolated", predictor.path.stem, ", ".join(unknown))
+    return predictor

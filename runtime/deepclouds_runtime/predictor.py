@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -143,6 +144,12 @@ class Predictor:
             if not low * (1 - _SLACK_SIZE) <= size <= high * (1 + _SLACK_SIZE):
                 found["size"] = f"a cloud of {size:.3g} mean free paths (trained on {low:g} to {high:g})"
         return list(found.values())
+
+
+@lru_cache(maxsize=2)
+def kept(model: str | None) -> Predictor:
+    """`Predictor(model)`, loaded once for callers that name it again and again."""
+    return Predictor(model)
 
 
 def find_model(model: str | Path | None) -> Path:

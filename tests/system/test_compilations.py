@@ -8,6 +8,7 @@ puts the camera's clipping planes and film: whatever the numbers of samples, que
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -16,24 +17,15 @@ import drjit as dr
 import numpy as np
 import pytest
 from deepclouds_runtime.loading import load
-from numpy.typing import NDArray
 
 from deepclouds.backend import backend, lanes_of, rows
+from tests.system.smooth_network import Smooth
 
 CLOUD = Path(deepclouds_runtime.__file__).parent / "data" / "demo.vdb"
 # Rays of the pilot, of the image, and of the audit's walks (two counts).
 CAMERA_KERNELS = 4
 # Renders of each kind: Dr.Jit puts the operations of a kernel into another order now and then, but not each time.
 TRIES = 4
-
-
-class Smooth:
-    """Stands in for a network: bright in the middle of a cloud, dark behind it."""
-
-    def predict(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return j (n,)."""
-        value: NDArray[np.float32] = ((0.3 + stencil[:, 2:].mean(axis=(1, 2))) * np.exp(-0.5 * aux[:, 5])).astype(np.float32)
-        return value
 
 
 @pytest.fixture(autouse=True)
@@ -85,9 +77,9 @@ def test_another_view_and_other_counts_compile_camera_rays_alone(sky: float) -> 
         known |= ran
 
     for i, other in enumerate(others):
-        new(lambda i=i: first.render(5 - i, seed=2 + i, error=0.2 + 0.01 * i, correct=True), counts)  # type: ignore[misc]
-        new(lambda i=i, other=other: other.render(3 + i, seed=12 + i, error=0.3 - 0.01 * i, correct=True), views)  # type: ignore[misc]
-        new(lambda i=i, other=other: other.render(seed=22 + i, error=0.1 + 0.01 * i), dialled)  # type: ignore[misc]
+        new(partial(first.render, 5 - i, seed=2 + i, error=0.2 + 0.01 * i, correct=True), counts)
+        new(partial(other.render, 3 + i, seed=12 + i, error=0.3 - 0.01 * i, correct=True), views)
+        new(partial(other.render, seed=22 + i, error=0.1 + 0.01 * i), dialled)
     assert min(counts) == 0, counts
     assert min(views) <= CAMERA_KERNELS, views
     assert min(dialled) == 0, dialled

@@ -24,17 +24,9 @@ from deepclouds_runtime.renderer import Renderer, RenderResult
 from numpy.typing import NDArray
 
 from deepclouds.exr import read_exr, write_exr
+from tests.system.smooth_network import Smooth
 
 CLOUD = Path(deepclouds_runtime.__file__).parent / "data" / "demo.vdb"
-
-
-class Smooth:
-    """Stands in for a network: bright in the middle of a cloud, dark behind it."""
-
-    def predict(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return j (n,)."""
-        value: NDArray[np.float32] = ((0.3 + stencil[:, 2:].mean(axis=(1, 2))) * np.exp(-0.5 * aux[:, 5])).astype(np.float32)
-        return value
 
 
 @pytest.fixture(autouse=True)
