@@ -25,7 +25,7 @@ _REGIONS = 24
 _DARK = 0.02
 # Points at which a correction is looked at to judge it.
 _LOOKED_AT = 1 << 16
-# Walks of the first round; every further round has as many walks as all before.
+# Walks of the first round; every further round has as many walks as all before, the last one what is left.
 _FIRST = 1 << 16
 # Walks by default: so many a pixel, within these limits.
 WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
@@ -217,9 +217,10 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
     while True:
         before = audit.before()
         reached = audit.remaining() if correct else before
-        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2 or 2 * audit.count > most or not more():
+        # A last round that adds little tells nothing new.
+        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2 or 1.1 * audit.count > most or not more():
             break
-        audit.extend(audit.count)
+        audit.extend(min(audit.count, most - audit.count))
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}
     if correct:
         correction = audit.correction()
