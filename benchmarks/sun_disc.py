@@ -165,7 +165,7 @@ def main(argv: Sequence[str]) -> int:
             table.append(f"| {name} | {diameter:g} | {' | '.join(found)} |")
             print(f"{table[-1]} {time.process_time() - clock:.1f} s", flush=True)
     if arguments.docs:
-        write_results(PAGE, "benchmarks.sun_disc", "\n".join(table))
+        write_results(PAGE, "sun_disc", "\n".join(table))
     return 0
 
 

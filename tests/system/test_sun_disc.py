@@ -28,6 +28,7 @@ from deepclouds_runtime.sunsky import split
 from deepclouds_runtime.volume_scene import VolumeOptions, cloud_description, volume_scene
 from numpy.typing import NDArray
 
+from benchmarks import sun_disc
 from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 
@@ -229,3 +230,17 @@ def test_a_dark_limb_is_read(mi: Any) -> None:
 def test_a_diameter_needs_a_sun() -> None:
     with pytest.raises(InputError, match="sun_diameter = 3: with an environment map there is no sun unless sun says where"):
         load(Path(__file__).parents[1] / "unit" / "data" / "tiles.vdb", env="sky.exr", sun_diameter=3)
+
+
+def test_the_table_of_what_a_middle_leaves_out_is_written(mi: Any, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected: a row for each sun and diameter, numbers alone in it, between the marks of the page; too few rays are refused."""
+    page = tmp_path / "rendering.md"
+    page.write_text((root / "docs" / "rendering.md").read_text())
+    monkeypatch.setattr(sun_disc, "PAGE", page)
+    monkeypatch.setattr(sun_disc, "DIAMETERS", (5.0,))
+    assert sun_disc.main(["--rays", "400", "--walks", "2", "--docs"]) == 0
+    rows = [line for line in page.read_text().splitlines() if line.startswith(tuple(f"| {name} |" for name in sun_disc.SUNS))]
+    assert len(rows) == len(sun_disc.SUNS)
+    assert all(" 5 |" in row and "nan" not in row for row in rows)
+    with pytest.raises(InputError, match="--rays 16: "):
+        sun_disc.main(["--rays", "16"])
