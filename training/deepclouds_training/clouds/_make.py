@@ -11,12 +11,14 @@ from deepclouds.errors import InputError
 from deepclouds.volume import Volume
 from deepclouds_training.clouds import (
     altocumulus,
+    block,
     cirrus,
     congestus,
     cumulonimbus,
     cumulus,
     cumulus_field,
     fractus,
+    pair,
     plume,
     pyro,
     shapes,
@@ -78,10 +80,14 @@ _ALL = (
     Family("pyro", "the rolling cloud of a fire or an explosion", pyro.PyroParameters, pyro.build, 50),
     Family("plume", "buoyant smoke that rolls up into swirls", plume.PlumeParameters, plume.build, 20),
     Family("shapes", "simple shapes, homogeneous or graded, hard or soft", shapes.ShapesParameters, shapes.build, 25),
+    Family("block", "a homogeneous or graded block or layer that fills its box", block.BlockParameters, block.build, 25),
+    Family("pair", "two bodies, each in the other's light and shadow", pair.PairParameters, pair.build, 30),
 )
 FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
 HELD_OUT: tuple[str, ...] = ("congestus", "plume")
-TRAINING: tuple[str, ...] = tuple(name for name in FAMILIES if name not in HELD_OUT)
+# Media that are not clouds but have a scene's hard shadows, wide layers and depths; data sets name them, they are no default.
+SUPPLEMENT: tuple[str, ...] = ("block", "pair")
+TRAINING: tuple[str, ...] = tuple(name for name in FAMILIES if name not in HELD_OUT + SUPPLEMENT)
 
 
 def find_family(name: str) -> Family:
