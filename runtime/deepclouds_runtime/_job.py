@@ -16,7 +16,8 @@ from deepclouds_runtime.sequence import VOLUMES, FileSequence, find_sequence, nu
 
 if TYPE_CHECKING:
     from deepclouds_runtime.progressive import Interruption
-    from deepclouds_runtime.renderer import Renderer, RenderResult
+    from deepclouds_runtime.renderer import Renderer
+    from deepclouds_runtime.result import RenderResult
     from deepclouds_runtime.turntable import Turntable
 
 # Noise of a pixel that a frame among others aims at, over the mean: with the noise of an image alone, moving clouds would flicker.

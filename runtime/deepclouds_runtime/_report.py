@@ -10,7 +10,8 @@ from deepclouds.memory import gib
 from deepclouds_runtime.error_parts import in_words
 
 if TYPE_CHECKING:
-    from deepclouds_runtime.renderer import Renderer, RenderResult
+    from deepclouds_runtime.renderer import Renderer
+    from deepclouds_runtime.result import RenderResult
 
 
 def describe(renderer: Renderer, say: Callable[[str], None]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from deepclouds.errors import InputError
 from deepclouds.exr import read_attributes, write_exr, write_png
-from deepclouds_runtime.renderer import RenderResult
+from deepclouds_runtime.result import RenderResult
 
 ATTRIBUTE = "deepclouds"
 _MOST_STOPS = 60

@@ -11,7 +11,7 @@ from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from deepclouds_runtime.renderer import RenderResult
+    from deepclouds_runtime.result import RenderResult
 
 INTERRUPTED = 130
 """Exit code of a command that was stopped by a signal, whichever it was."""

@@ -7,7 +7,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from deepclouds_runtime.renderer import RenderResult
+    from deepclouds_runtime.result import RenderResult
 
 
 def render(

@@ -16,7 +16,7 @@ from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
 from deepclouds_runtime.render import main
-from deepclouds_runtime.renderer import RenderResult
+from deepclouds_runtime.result import RenderResult
 from deepclouds_runtime.scattering import NetworkScattering, WalkScattering
 from numpy.typing import NDArray
 

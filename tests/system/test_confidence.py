@@ -16,7 +16,7 @@ from deepclouds_runtime.confidence import DOUBTFUL, confidence, doubtful, relati
 from deepclouds_runtime.frame_source import Seen
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.octree import Octree, lattice_around
-from deepclouds_runtime.renderer import RenderResult
+from deepclouds_runtime.result import RenderResult
 from numpy.typing import NDArray
 
 from deepclouds.backend import backend

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deepclouds_runtime.loading import load
-from deepclouds_runtime.renderer import RenderResult
+from deepclouds_runtime.result import RenderResult
 from deepclouds_runtime.scattering import NetworkScattering, WalkScattering
 from numpy.typing import NDArray
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from deepclouds_runtime._mitsuba import mitsuba
-from deepclouds_runtime.renderer import COLOURS, LAYERS, Renderer, RenderResult
+from deepclouds_runtime.renderer import Renderer
+from deepclouds_runtime.result import COLOURS, LAYERS, RenderResult
 from deepclouds_runtime.scene import CloudScene, surfaces_alone
 from deepclouds_runtime.scene_lights import read_lights
 from numpy.typing import NDArray

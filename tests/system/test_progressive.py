@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import is_complete, save
-from deepclouds_runtime.renderer import Renderer, RenderResult
+from deepclouds_runtime.renderer import Renderer
+from deepclouds_runtime.result import RenderResult
 from numpy.typing import NDArray
 
 from deepclouds.exr import read_exr, write_exr
@@ -74,7 +75,7 @@ def test_an_interruption_leaves_an_image_of_what_there_is(renderer: Renderer, sp
 
 def test_an_interruption_between_passes_keeps_them(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pixels then have taken different numbers of samples, and each is divided by its own."""
-    monkeypatch.setattr("deepclouds_runtime.renderer._PASS", 1000)
+    monkeypatch.setattr("deepclouds_runtime.frame._PASS", 1000)
     # Asked before the second round, and before each of its two passes; what is asked during the prediction does not count.
     asked, network = iter(range(1, 1000)), renderer._network
     assert network is not None

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.render import main
-from deepclouds_runtime.renderer import COLOURS, LAYERS, RenderResult
+from deepclouds_runtime.result import COLOURS, LAYERS, RenderResult
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError

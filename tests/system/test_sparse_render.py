@@ -14,7 +14,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from deepclouds_runtime.renderer import Renderer, RenderResult
+from deepclouds_runtime.renderer import Renderer
+from deepclouds_runtime.result import RenderResult
 from deepclouds_runtime.volume_scene import VolumeOptions, volume_scene
 from numpy.typing import NDArray
 

@@ -1,0 +1,324 @@
+"""One frame: what is predicted for it, its passes of camera samples, and the light along them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from deepclouds.backend import lanes_of
+from deepclouds_runtime import stratified
+from deepclouds_runtime._mitsuba import mitsuba, plain
+from deepclouds_runtime.adaptive import Adaptive
+from deepclouds_runtime.all_round import AllRound, spread
+from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
+from deepclouds_runtime.camera import Camera
+from deepclouds_runtime.confidence import confidence, relative_errors
+from deepclouds_runtime.disc import background, looks_into
+from deepclouds_runtime.fast import fast_cloud_light
+from deepclouds_runtime.film import Film
+from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
+from deepclouds_runtime.lights import Environment
+from deepclouds_runtime.result import Image
+from deepclouds_runtime.scene import CloudScene
+from deepclouds_runtime.stratified import Stratified
+from deepclouds_runtime.surfaces import reflected, reflected_from_cloud
+from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
+
+# Noise of a pixel that the fast mode aims at, over the mean.
+ERROR = 0.02
+# Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB. Those that end in a query or a walk take long, and
+# an interruption waits for them.
+_PASS, _SLOW_PASS = 1 << 19, 1 << 16
+# Rays that look for what the camera sees, and collisions on each of them.
+_PILOT, _PILOT_DEPTHS = 1 << 16, 4
+# Most queries for the suns, and as many for the light from all around.
+_BUDGET = 60_000
+# Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
+_BEAMS, _BRIGHT = 48, 0.1
+# The same for light that the cloud throws on surfaces.
+_BEAMS_THROWN = 12
+# Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
+_ROOT, _ROOT_AROUND = 2.0, 4.0
+# Collisions of a camera ray that get shadow rays.
+_DEPTHS = 4
+
+
+@dataclass
+class Frame:
+    """The passes of one render and what they gathered.
+
+    Attributes
+    ----------
+    scene, camera, cloud, types, seed
+        what is rendered, and the root of all random numbers.
+    on_surfaces, on_cloud
+        what lights the surfaces, and what lights the cloud.
+    interreflection
+        whether surfaces receive the cloud's light.
+    depths
+        collisions of a camera ray that get shadow rays.
+    sampled
+        whether multiple scattering is sampled at one of these collisions, past the orders that are exact, in place of interpolated.
+    counts, seconds
+        work done, and seconds by stage.
+    samples
+        of the pixels that have taken most.
+    sources, named
+        multiple scattering of this camera, once it is predicted; and by name, as predicted, before any correction.
+    all_round
+        multiple scattering as the surfaces see it.
+    errors
+        the network's error to expect, pixel by pixel, where it knows its errors.
+    found
+        what an audit found.
+    """
+
+    scene: CloudScene
+    camera: Camera
+    cloud: Cloud
+    on_surfaces: Lights
+    on_cloud: Lights
+    types: Any
+    seed: int
+    interreflection: bool
+    depths: int = _DEPTHS
+    sampled: bool = False
+    counts: Counts = field(default_factory=Counts)
+    seconds: dict[str, float] = field(default_factory=dict)
+    samples: int = 0
+    sources: list[FrameSource] | None = None
+    named: dict[str, FrameSource] = field(default_factory=dict)
+    all_round: AllRound | None = None
+    errors: Image | None = None
+    found: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.film, self._adaptive = Film(self.scene.size), Adaptive(self.scene.size)
+
+    def skipped(self) -> dict[str, int]:
+        """Queries that were not needed, by reason; a sample counts as the one query that the reference mode would ask."""
+        if self.sources is None or self.sampled:
+            return {"thin samples": self.counts.skipped}
+        distinct = len({a for a in self.cloud.albedo if a > 0})
+        return {
+            "samples that met no cloud": self.counts.camera_samples - self.counts.cloud_samples,
+            "samples interpolated": self.counts.cloud_samples,
+            "equal colour channels": sum(s.queries for s in self.sources) // max(distinct, 1) * (len(self.cloud.albedo) - distinct),
+            "suns without power": sum(max(sun.irradiance) <= 0 for sun in self.on_cloud.suns),
+        }
+
+    @property
+    def thrower(self) -> Cloud:
+        """The cloud as surfaces see it."""
+        return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
+
+    def prepare_thrown(self, tolerance: float) -> None:
+        """Predict multiple scattering for the light that the cloud throws on surfaces; from then on their rays ask no network."""
+        clock = time.perf_counter()
+        types = self.types
+        lower, upper = self.cloud.field.volume.bounds
+        middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
+        radius = 0.5 * float(np.linalg.norm(upper - lower))
+        pixel, numbers = self._pilot(_PILOT // 8)
+        origin, direction, _ = self.camera.rays(pixel, numbers)
+        # What the camera sees of the surfaces, and what the middle of the cloud sees of them: the probe stands there.
+        around = spread(_PILOT // 8).astype(np.float32)
+        out = types.Array3f(*(lanes_of(types.Float, around[:, c]) for c in range(3)))
+        parts = []
+        for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
+            _, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
+            found: Any = dr.compress(shown)
+            place = dr.fma(ahead, distance, start)
+            parts.append([np.array(dr.gather(types.Float, v, found)) for v in place])
+        places = np.concatenate([np.stack(part, axis=1) for part in parts])
+        if len(places):
+            # Toward points spread through the cloud's sphere.
+            aims = np.array(0.5 * (lower + upper)) + radius * np.cbrt((np.arange(len(places)) * 0.6180339887) % 1)[:, None] * np.roll(
+                spread(len(places)), len(places) // 3, axis=0
+            )
+            ahead = aims - places
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
+            o, d = (types.Array3f(*(lanes_of(types.Float, v[:, c]) for c in range(3))) for v in (places, ahead))
+            end = dr.full(types.Float, math.inf, len(places))
+            seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
+            lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
+            for source, _ in self.on_surfaces.sources:
+                lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
+            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, 2 * tolerance, _BUDGET // 4)
+            self.counts.queries += self.all_round.queries
+        self.spent("light on surfaces", clock)
+
+    def _pilot(self, most: int) -> tuple[Any, Stratified]:
+        """Pixels spread over the image, no more than `most`, and random numbers for them."""
+        width, height = self.scene.size
+        stride = math.ceil(math.sqrt(width * height / most))
+        columns, rows = np.arange(0, width, stride), np.arange(0, height, stride)
+        pixel = lanes_of(self.types.UInt32, (rows[:, None] * width + columns).ravel())
+        one = dr.opaque(self.types.UInt32, 1)
+        return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
+
+    def prepare(self, tolerance: float, quick: bool = False) -> None:
+        """Predict multiple scattering for this camera; from then on camera rays ask no network. `quick`: at an eighth of the nodes."""
+        clock = time.perf_counter()
+        pixel, numbers = self._pilot(_PILOT // 4 if quick else _PILOT)
+        origin, direction, end = self._camera_rays(pixel, numbers)
+        seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
+        self.spent("pilot", clock)
+        clock = time.perf_counter()
+        suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
+        around: list[Arriving] = []
+        wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
+        for source, _ in self.on_cloud.sources:
+            around += from_source(self.types, source, beams, isinstance(source, Environment), self.seed)
+        # What is a large part of all light gets the fine nodes of a sun.
+        power = sum(max(light.irradiance) for light in around)
+        suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
+        around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
+        found = {
+            "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, tolerance, _BUDGET),
+            "light from all around": frame_source(self.cloud, around, [self.camera], seen, wide * _ROOT_AROUND, tolerance, _BUDGET),
+        }
+        self.named = {name: source for name, source in found.items() if source is not None}
+        self.sources = list(self.named.values())
+        self.errors = relative_errors(self.sources, seen, np.array(pixel), self.scene.size)
+        self.counts.queries += sum(source.queries for source in self.sources)
+        self.spent("prediction", clock)
+
+    def audit(self, correct: bool, error: float, until: float, interrupted: Callable[[], bool] | None) -> None:
+        """Audit the sources, and correct them, with walks; no further round begins after the time `until`."""
+        if not self.sources:
+            return
+        clock = time.perf_counter()
+        width, height = self.scene.size
+        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, (width, height), self.seed)
+        # Walks are as noisy as any path: half of the error takes four times as many.
+        worth = WALKS_A_PIXEL * width * height * (ERROR / error) ** 2
+        most = int(np.clip(worth, FEWEST, MOST)) if math.isinf(until) else MOST
+
+        def more() -> bool:
+            return time.perf_counter() < until and not (interrupted is not None and interrupted())
+
+        outcome = audited(found, self.sources, correct, error, most, more)
+        self.sources, self.found = outcome.sources, outcome.found
+        self.spent("audit", clock)
+
+    def _camera_rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any]:
+        """Camera rays and where surfaces end them."""
+        origin, direction, end = self.camera.rays(pixel, numbers)
+        if self.scene.surfaces is not None:
+            _, end, _ = self._surfaces(origin, direction, end)
+        return origin, direction, end
+
+    def round(
+        self,
+        first: int,
+        samples: int,
+        most: int,
+        progress: Callable[[float], None] | None,
+        interrupted: Callable[[], bool] | None = None,
+    ) -> bool:
+        """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all; returns whether it was interrupted."""
+        total = len(self._adaptive.active)
+        pixels = max(1, (_SLOW_PASS if self.sampled else _PASS) // samples)
+        for start in range(0, total, pixels):
+            if interrupted is not None and interrupted():
+                return True
+            chosen = self._adaptive.active[start : start + pixels]
+            self.add(chosen, first, samples, most)
+            self.film.taken[chosen] += samples
+            if progress is not None:
+                progress((first + samples * min(start + pixels, total) / total) / most)
+        self.samples += samples
+        return False
+
+    def settle(self, before: Image, done: int, error: float, rest: bool = True) -> tuple[float, float]:
+        """Estimate the noise after a round, see `Adaptive.settle`: `before` is the image before it, of `done` samples."""
+        return self._adaptive.settle(before, self.film.beauty(), done, self.samples, error, rest)
+
+    def _seed(self) -> Any:
+        return dr.opaque(self.types.UInt32, self.seed & 0xFFFFFFFF)
+
+    def add(self, pixels: NDArray[np.uint32], sample: int, samples: int, most: int) -> None:
+        """Render the pixels of these numbers, `samples` samples each from number `sample` of `most` on."""
+        types, scene = self.types, self.scene
+        n = len(pixels) * samples
+        self.counts.camera_samples += n
+        count = dr.opaque(types.UInt32, samples)
+        index = dr.arange(types.UInt32, n)
+        local = index // count
+        pixel = dr.gather(types.UInt32, types.UInt32(pixels), local)
+        numbers = Stratified(
+            types, pixel, index - local * count + dr.opaque(types.UInt32, sample), dr.opaque(types.UInt32, most), self._seed()
+        )
+        where = pixels, samples
+        origin, direction, end = self.camera.rays(pixel, numbers)
+        interaction: Any = None
+        shown: Any = None
+        if scene.surfaces is not None:
+            interaction, end, shown = self._surfaces(origin, direction, end)
+        clock = time.perf_counter()
+        if self.sources is None and not self.sampled:
+            light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
+        else:
+            sources = self.sources or []
+            light = fast_cloud_light(
+                self.cloud, self.on_cloud, sources, origin, direction, end, numbers, self.counts, self.depths, self.sampled
+            )
+        dr.eval(light.direct, light.indirect)
+        dr.sync_thread()
+        self.spent("cloud", clock)
+        clock = time.perf_counter()
+        self.film.add(*where, "volume_direct", light.direct)
+        self.film.add(*where, "volume_indirect", light.indirect)
+        self.film.add(*where, "volume_opacity", [light.opacity])
+        depth = self.camera.distance(dr.fma(direction, light.distance, origin))
+        self.film.add(*where, "volume_Z", [depth * light.opacity])
+        through = light.transmittance
+        behind = through
+        alpha = light.opacity
+        if interaction is not None:
+            colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
+            if self.interreflection:
+                weight = dr.select(shown, through, 0)
+                thrown = reflected_from_cloud(self.thrower, self.on_cloud, interaction, weight, numbers, self.counts)
+                colours = [a + b for a, b in zip(colours, thrown, strict=True)]
+            self.film.add(*where, "surface", [value * through for value in colours])
+            behind = dr.select(shown, 0, through)
+            alpha = alpha + dr.select(shown, through, 0)
+        look = None if scene.hide_emitters else background(types, scene.backdrop, scene.suns)
+        if look is not None:
+            sky, shines = look(direction)
+            self.film.add(*where, "background", [value * behind for value in sky])
+            alpha = alpha + dr.select(shines, behind, 0)
+            into = looks_into(types, scene.suns, direction)
+            if into is not None:
+                self._adaptive.dazzled[pixels] |= np.array(dr.block_sum(dr.select(into, types.Float(1), 0), samples)) > 0
+        self.film.add(*where, "A", [alpha])
+        self.spent("surfaces and background", clock)
+
+    def _surfaces(self, origin: Any, direction: Any, end: Any) -> tuple[Any, Any, Any]:
+        """What the rays hit, where they end, and whether they hit anything."""
+        mi, types = mitsuba(), self.types
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+        ray.maxt = mi.Float(end)
+        interaction = self.scene.surfaces.ray_intersect(ray)
+        shown = plain(types, interaction.is_valid())
+        return interaction, dr.select(shown, plain(types, interaction.t), end), shown
+
+    def spent(self, stage: str, since: float) -> None:
+        """Add the seconds since `since` to a stage."""
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - since
+
+    def image(self) -> dict[str, Image]:
+        """All channels (h, w) of the finished image."""
+        channels = self.film.channels()
+        if self.errors is not None:
+            channels["confidence"] = confidence(self.errors, channels)
+        return channels

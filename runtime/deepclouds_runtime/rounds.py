@@ -1,0 +1,123 @@
+"""Rounds of camera samples, until there are as many as asked for or the noise is as small as asked for."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+from deepclouds_runtime.frame import Frame
+from deepclouds_runtime.result import RenderResult
+
+_LOG = logging.getLogger(__name__)
+# Samples a pixel of which path tracing foretells how many it will take.
+_FORETELL = 16
+SoFar = Callable[[float], RenderResult]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What is told and asked between rounds, see `deepclouds_runtime.renderer.Renderer.render`."""
+
+    progress: Callable[[float], None] | None = None
+    partial: Callable[[RenderResult], None] | None = None
+    interrupted: Callable[[], bool] | None = None
+    estimate: Callable[[float], None] | None = None
+
+    @property
+    def stops(self) -> bool:
+        """Whether to stop."""
+        return self.interrupted is not None and self.interrupted()
+
+
+def fixed_rounds(frame: Frame, most: int, error: float, watch: Watch, so_far: SoFar) -> tuple[float, bool]:
+    """Take `most` samples of every pixel; returns the noise, as far as it is known, and whether somebody stopped it.
+
+    In rounds that double their number where somebody watches, else all at once: the samples are the same.
+    """
+    noise = math.inf
+    if watch.partial is None and watch.interrupted is None:
+        frame.round(0, most, most, watch.progress)
+        return noise, False
+    frame.round(0, 1, most, watch.progress)
+    while frame.samples < most:
+        if watch.stops:
+            return noise, True
+        before, done = frame.film.beauty(), frame.samples
+        if watch.partial is not None:
+            watch.partial(so_far(noise))
+        if frame.round(done, min(done, most - done), most, watch.progress, watch.interrupted):
+            return noise, True
+        noise, _ = frame.settle(before, done, error, rest=False)
+        if watch.estimate is not None:
+            watch.estimate(noise)
+    return noise, False
+
+
+def rounds_for_error(
+    frame: Frame, most: int, target: float | None, error: float, end: float, rest: bool, watch: Watch, so_far: SoFar
+) -> tuple[float, bool]:
+    """Take samples until the noise is small enough; returns it, and whether somebody stopped it.
+
+    Parameters
+    ----------
+    frame, most
+        what takes them, and the most samples a pixel.
+    target
+        noise to stop at, over the mean; None goes on until `end`.
+    error
+        noise by which pixels are judged.
+    end
+        of the time, in seconds of `time.perf_counter`; no round begins that should end later.
+    rest
+        whether blocks of pixels may rest.
+    watch, so_far
+        who is told, and the image so far from its noise.
+    """
+    _say_ignored(error, int(frame.scene.sensor.sampler().sample_count()))
+    started, noise, growth, pace = time.perf_counter(), math.inf, 2.0, 0.0
+    frame.round(0, 1, most, None)
+    while frame.samples < most and (target is None or not noise <= target):
+        if watch.stops:
+            return noise, True
+        before, done = frame.film.beauty(), frame.samples
+        more = min(math.ceil(done * (growth - 1)), most - done)
+        if done > 1 and not math.isinf(end):
+            left = end - time.perf_counter()
+            more = min(more, int(left / pace)) if left > 0 else 0
+        if more < 1:
+            break
+        if watch.partial is not None:
+            watch.partial(so_far(noise))
+        clock = time.perf_counter()
+        if frame.round(done, more, most, None, watch.interrupted):
+            return noise, True
+        pace = max(time.perf_counter() - clock, 1e-6) / more
+        noise, growth = frame.settle(before, done, error, rest)
+        if not rest and done < _FORETELL <= frame.samples and noise > error:
+            _say_ahead(frame.samples, noise, error, end, most, pace)
+        if watch.estimate is not None:
+            watch.estimate(noise)
+        if watch.progress is not None:
+            # Of the time where that alone decides.
+            share = (time.perf_counter() - started) / (end - started) if target is None else (error / max(noise, 1e-9)) ** 2
+            watch.progress(min(share, 1.0))
+    return noise, False
+
+
+@cache
+def _say_ignored(error: float, asked: int) -> None:
+    """Once for all frames of a sequence."""
+    _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
+
+
+def _say_ahead(samples: int, noise: float, error: float, end: float, most: int, pace: float) -> None:
+    """Say what a path-traced image will take."""
+    whole = min(samples * (noise / error) ** 2, most)
+    seconds = (whole - samples) * pace
+    left = end - time.perf_counter()
+    text = f"path tracing: noise of a pixel is about {noise:.2g} after {samples} samples; {error:g} takes about {whole:,.0f}"
+    _LOG.info("%s, %.0f s more%s", text, seconds, "" if seconds <= left else f", but there are only {max(left, 0.0):.0f} s left")
