@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import _TURN, _phase, _Queries, _sample_cosine, _stream, _uniform
 from deepclouds.medium.phase import as_lobes, rotate_to
@@ -37,6 +38,7 @@ def trace_one_sun(
     seed: int,
     lanes: int = 4096,
     connect: float = 1.0,
+    varying: AlbedoField | None = None,
 ) -> NDArray[np.float32]:
     """Unbiased estimates of ``4 pi J / (albedo^2 E)``, one for every walk: `trace_walks` for one sun, with less noise.
 
@@ -48,6 +50,9 @@ def trace_one_sun(
         (n, 3) unit vectors TOWARD the sun.
     connect
         vertices and branches are followed up with probability ``min(1, connect * value)``, weighted by its inverse.
+    varying
+        albedo at the collisions, in place of `albedos`: then the estimates are those of ``4 pi J / (albedo(x) E)``, the albedo at the
+        point itself taken out alone, and m is the number of its channels.
 
     Returns
     -------
@@ -57,6 +62,8 @@ def trace_one_sun(
     -----
     A point outside of the box sends no side branch: there the walk's own collision counts in full.
     """
+    if varying is not None:
+        albedos = np.ones((len(points), varying.channels), np.float32)
     n, m_albedos = len(points), albedos.shape[1]
     total = n * walks
     if total == 0 or field.majorant == 0.0:
@@ -69,12 +76,23 @@ def trace_one_sun(
     counter = dr.zeros(types.UInt32, 1)
     key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
     dr.make_opaque(result, counter, key)
-    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect)
+    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect, varying)
     return np.array(result).reshape(n, walks, m_albedos)
 
 
 @dr.syntax
-def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, counter: Any, result: Any, lanes: int, connect: float) -> None:
+def _loop(
+    field: Field,
+    queries: _Queries,
+    walks: int,
+    total: int,
+    key: Any,
+    counter: Any,
+    result: Any,
+    lanes: int,
+    connect: float,
+    varying: AlbedoField | None,
+) -> None:
     types = field.types
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     m_albedos = len(queries.albedos)
@@ -100,6 +118,8 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
     sun = dr.zeros(Array3f, lanes)
     albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
+    # Albedo where a branch has landed, if it varies; else the weight has it already.
+    of_branch_end = [dr.full(Float, 1, lanes) for _ in range(m_albedos if varying is not None else 0)]
 
     clock = dr.zeros(UInt32, lanes)
 
@@ -153,9 +173,18 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         # A walk's results are its lane's alone.
         lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
         for m in range(m_albedos):
-            dr.scatter_add(result, value * weight[m], number * m_albedos + m, lit, mode=dr.ReduceMode.NoConflicts)
+            arriving = value * weight[m]
+            if varying is not None:
+                arriving *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
+            dr.scatter_add(result, arriving, number * m_albedos + m, lit, mode=dr.ReduceMode.NoConflicts)
 
         collision = hit & walking
+        if varying is not None:
+            # The weight of a vertex has its own albedo already when it is connected.
+            here = varying.at_unit(unit, hit)
+            for m in range(m_albedos):
+                weight[m] = dr.select(collision, weight[m] * here[m], weight[m])
+                of_branch_end[m] = dr.select(hit & (task == _BRANCH), here[m], of_branch_end[m])
         position = dr.select(collision, unit, position)
         toward_sun = _phase(lobes, dr.dot(direction, sun))
         of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
@@ -164,8 +193,9 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
 
         # Once a vertex is dealt with, light of the next order may come by a side branch.
         leaving = begun | (collision & ~shadow) | (over & (task == _SHADOW))
-        for m in range(m_albedos):
-            weight[m] = dr.select(leaving & ~begun, weight[m] * albedo[m], weight[m])
+        if varying is None:
+            for m in range(m_albedos):
+                weight[m] = dr.select(leaving & ~begun, weight[m] * albedo[m], weight[m])
         rng, u_cosine = _uniform(types, rng)
         rng, u_azimuth = _uniform(types, rng)
         rng, u_branch = _uniform(types, rng)

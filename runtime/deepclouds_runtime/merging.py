@@ -34,7 +34,7 @@ def merged(media: list[Medium], notes: list[str]) -> Medium:
     Raises
     ------
     InputError
-        when albedo or phase function differ, boxes overlap, or the clouds are too small for the distance between them.
+        when albedo or phase function differ, an albedo varies in space, boxes overlap, or the clouds are too small for their distance.
 
     Notes
     -----
@@ -42,6 +42,8 @@ def merged(media: list[Medium], notes: list[str]) -> Medium:
     is finer is averaged, so that hard edges become ramps of a voxel's width.
     """
     first = media[0]
+    if any(medium.varying is not None for medium in media):
+        raise InputError(f"{len(media)} clouds, and an albedo that varies in space: make it one number, or render one cloud at a time")
     for other in media[1:]:
         for name in ("albedo", "phase"):
             if not np.allclose(getattr(first, name), getattr(other, name), rtol=1e-5, atol=1e-6):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.medium.albedo import AlbedoGrid
 from deepclouds.volume import Volume
 
 Matrix = NDArray[np.float64]
@@ -108,4 +109,46 @@ def locate(density: NDArray[np.float32], scale: float, boxes: list[Matrix], sigm
     raise InputError(
         f"cannot place the grid of the medium: at random points its extinction differs from the medium's by up to {100 * worst:.2g} % "
         "of the largest value; use a gridvolume with filter_type 'trilinear' whose box is that of the cube around it"
+    )
+
+
+def locate_albedo(values: NDArray[np.float32], boxes: list[Matrix], volume: Volume, albedo: Any, seed: int = 0) -> AlbedoGrid:
+    """The placement in which a grid of albedos agrees with what the medium itself says at random points.
+
+    Parameters
+    ----------
+    values
+        (nz, ny, nx, channels).
+    boxes
+        candidate maps from the unit cube to the world; each is tried in all 48 orientations.
+    volume
+        the density: where it is 0 the medium has no albedo.
+    albedo
+        callable (n, 3) world points -> (n, channels) albedo, and (n,) whether there is any medium.
+    seed
+        of the random points.
+
+    Raises
+    ------
+    InputError
+        when none agrees.
+    """
+    random = np.random.default_rng(seed)
+    filled = np.argwhere(volume.density > 0)
+    if not len(filled):
+        return AlbedoGrid(values, boxes[0])
+    chosen = filled[random.integers(0, len(filled), 512)][:, ::-1] + random.random((512, 3))
+    points = chosen / np.array(volume.resolution) @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
+    truth, known = albedo(points)
+    worst = np.inf
+    for box in boxes:
+        for candidate in orientations(box):
+            grid = AlbedoGrid(values, candidate)
+            mismatch = float(np.quantile(np.abs(grid.sample(points[known]) - truth[known]).max(axis=1), 0.98))
+            if mismatch < 2e-3:
+                return grid
+            worst = min(worst, mismatch)
+    raise InputError(
+        f"cannot place the grid of the albedo: at random points it differs from the medium's own by up to {worst:.2g}; "
+        "use a gridvolume with filter_type 'trilinear' and the to_world of the density's grid"
     )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.memory import peak_bytes
 from deepclouds_runtime._mitsuba import mitsuba, types_of
@@ -115,10 +116,11 @@ class Renderer:
         self.predictor = predictor
         self._types = types_of(mitsuba())
         self._field = Field(self._types, scene.volume, scene.scale)
+        self._albedo = None if scene.varying is None else AlbedoField(self._field, scene.varying)
         self._network: NetworkScattering | None = None
         # Whether paths are traced in place of the network, asked for or not.
-        self._walks = unbiased and scene.max_depth != 2
-        if scene.max_depth != 2 and not unbiased:
+        self._walks = (unbiased or scene.varying is not None) and scene.max_depth != 2
+        if scene.max_depth != 2 and not self._walks:
             if predictor is None:
                 raise InputError("multiple scattering needs a model; give one, or render single scattering alone (max_depth 2)")
             self._network = NetworkScattering(self._field, predictor, unit, origin)
@@ -127,6 +129,11 @@ class Renderer:
         self.notes = scene.notes
         if unbiased:
             self.notes += ("unbiased: paths are traced with our own tracker until the noise is as asked; no network is asked",)
+        elif self._walks:
+            self.notes += (
+                "the albedo varies in space, and the network knows one albedo a query: multiple scattering is path-traced in place of it, "
+                "noisy and slow",
+            )
         if self._network is not None and (unknown := _unknown(self._network, predictor, scene)):
             instead = "extrapolated" if extrapolate else "path-traced in place of it, noisy and slow ('extrapolate' asks it all the same)"
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
@@ -223,7 +230,7 @@ class Renderer:
         watch = Watch(progress, partial, interrupted, estimate)
         scattering = None
         if scene.max_depth != 2:
-            scattering = WalkScattering(self._field, 1, seed) if self._walks else self._network
+            scattering = WalkScattering(self._field, 1, seed, self._albedo) if self._walks else self._network
         adaptive = self.mode == "fast"
         # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
         sampled = adaptive and scattering is not None and (self._walks or self._exact_orders > 1)
@@ -231,7 +238,7 @@ class Renderer:
         if spp is None and self.unbiased:
             most = _MOST_SAMPLES
         exact = 1 if self._walks else self._exact_orders
-        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, exact=exact), self._lights()
+        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo), self._lights()
         camera = Camera(types, scene.sensor)
         frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, sampled=sampled)
         frame.spent("lights", started)
@@ -309,7 +316,11 @@ class Renderer:
         statistics.skipped = frame.skipped()
         statistics.audit = frame.found
         levels = 0 if self._network is None else self._network.descriptor.nbytes
-        statistics.memory = {"field": self._field.nbytes, "levels": levels, "peak": peak_bytes()}
+        statistics.memory = {
+            "field": self._field.nbytes + (0 if self._albedo is None else self._albedo.nbytes),
+            "levels": levels,
+            "peak": peak_bytes(),
+        }
         notes = self.notes
         if "confidence" in channels:
             statistics.network = doubtful(channels["confidence"], channels)

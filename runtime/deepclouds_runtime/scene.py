@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from deepclouds.errors import InputError
+from deepclouds.medium.albedo import AlbedoGrid
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.merging import merged
@@ -32,7 +33,7 @@ class CloudScene:
     scale
         extinction per unit of density, 1 / world length.
     albedo
-        single-scattering albedo, one value a colour channel.
+        single-scattering albedo, one value a colour channel; the largest ones, where it varies in space.
     phase
         phase function (g1, g2, weight), see `deepclouds.medium.phase`.
     suns
@@ -51,6 +52,8 @@ class CloudScene:
         what was approximated in reading, in sentences.
     backdrop
         the environment emitter that the camera sees, or None.
+    varying
+        the albedo, where it varies in space, or None.
     """
 
     volume: Volume
@@ -65,6 +68,7 @@ class CloudScene:
     max_depth: int = -1
     notes: tuple[str, ...] = field(default=())
     backdrop: Any = None
+    varying: AlbedoGrid | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -88,8 +92,8 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
     Raises
     ------
     InputError
-        for everything outside of what we render: no cloud, several of different albedo or phase function, chromatic extinction, varying
-        albedo, phase functions other than `hg`, `isotropic` and a `blendphase` of two of them, emitters other than `directional`,
+        for everything outside of what we render: no cloud, several of different albedo or phase function or of varying albedo, chromatic
+        extinction, phase functions other than `hg`, `isotropic` and a `blendphase` of two of them, emitters other than `directional`,
         `constant`, `envmap` and `sunsky`, cameras other than `perspective`, `thinlens` and `orthographic`, path lengths other than -1
         and 2, surfaces that let light through, media outside of the clouds, images without pixels.
     """
@@ -121,6 +125,7 @@ def read_scene(scene: Any, sensor: Any = 0, max_depth: int | None = None, hide_e
         check_depth(max_depth),
         tuple(notes),
         lights.backdrop,
+        medium.varying,
     )
 
 

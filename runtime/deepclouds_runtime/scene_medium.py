@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
+from deepclouds.medium.albedo import AlbedoGrid
 from deepclouds.volume import Volume
 from deepclouds_runtime._mitsuba import mitsuba
-from deepclouds_runtime.placement import box_transform, cube_transform, locate
+from deepclouds_runtime.placement import box_transform, cube_transform, locate, locate_albedo
 
 _LOBES = ("HGPhaseFunction", "IsotropicPhaseFunction")
 _PHASE_NAMES = "`hg`, `isotropic` and a `blendphase` of two of them"
@@ -26,12 +27,16 @@ _BOX_VOXELS = 32
 
 @dataclass(frozen=True)
 class Medium:
-    """A medium: density and its place, extinction per unit of density, albedo of each colour channel, phase function (g1, g2, weight)."""
+    """A medium: density and its place, extinction per unit of density, albedo of each colour channel, phase function (g1, g2, weight).
+
+    Where the albedo varies in space, `varying` is it, and `albedo` its largest values.
+    """
 
     volume: Volume
     scale: float
     albedo: tuple[float, ...]
     phase: tuple[float, float, float]
+    varying: AlbedoGrid | None = None
 
 
 def read_medium(container: Any) -> Medium:
@@ -58,6 +63,9 @@ def read_medium(container: Any) -> Medium:
         _check_cover(container, volume)
     else:
         volume, scale = _homogeneous(container, medium)
+    if "albedo.data" in parameters:
+        varying = _varying_albedo(container, medium, np.array(parameters["albedo.data"]), volume)
+        return Medium(volume, scale, varying.largest, phase, varying)
     return Medium(volume, scale, _read_albedo(parameters), phase)
 
 
@@ -196,10 +204,24 @@ def _homogeneous(container: Any, medium: Any) -> tuple[Volume, float]:
     raise InputError(f"a homogeneous medium in a {container.class_name()}: deepclouds fills a `cube` or a `sphere`")
 
 
+def _varying_albedo(container: Any, medium: Any, data: NDArray[Any], volume: Volume) -> AlbedoGrid:
+    """The albedo's grid, in the place where the medium itself has it."""
+    channels = len(mitsuba().Spectrum())
+    values = np.ascontiguousarray(data.reshape(*data.shape[:3], -1), np.float32)
+    if values.shape[3] not in (1, channels):
+        raise InputError(f"the albedo's grid has {values.shape[3]} channels: give 1 or {channels}")
+    values = np.broadcast_to(values, (*values.shape[:3], channels))
+
+    def albedo(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        scattering, extinction = _coefficients(medium, points)
+        filled = extinction > 0
+        return scattering / np.where(filled, extinction, 1)[:, None], filled
+
+    return locate_albedo(values, [volume.to_world, *_grid_boxes(container, medium)], volume, albedo)
+
+
 def _read_albedo(parameters: Any) -> tuple[float, ...]:
     names = [name for name in parameters.keys() if name.startswith("albedo")]
-    if any(name.endswith(".data") for name in names):
-        raise InputError("the medium's albedo varies in space (a gridvolume); use one colour")
     channels = len(mitsuba().Spectrum())
     for name in names:
         value = np.ravel(np.array(parameters[name])).astype(np.float64)

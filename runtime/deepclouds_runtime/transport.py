@@ -17,6 +17,7 @@ from typing import Any
 import drjit as dr
 
 from deepclouds.backend import lanes_of
+from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import TAU_OPAQUE, distance_at, optical_depth
 from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
@@ -53,7 +54,7 @@ class Cloud:
     field
         extinction.
     albedo
-        single-scattering albedo, one value a colour channel.
+        single-scattering albedo, one value a colour channel; the largest ones, where it varies in space.
     phase
         phase function (g1, g2, weight), see `deepclouds.medium.phase`.
     scattering
@@ -63,6 +64,8 @@ class Cloud:
     exact
         orders of scattering that are sampled before `scattering` is asked: with 1 it is asked at the first collision of a ray, with 2 at
         the second one, and so on.
+    varying
+        the albedo, where it varies in space. `scattering` then gives J over the albedo at the point, see `WalkScattering`.
     """
 
     field: Field
@@ -71,6 +74,13 @@ class Cloud:
     scattering: MultipleScattering | None
     known: Callable[[Any, Any], list[Any]] | None = None
     exact: int = 1
+    varying: AlbedoField | None = None
+
+    def albedo_at(self, points: Any) -> list[Any]:
+        """Albedo of each channel at world points (Array3f)."""
+        if self.varying is not None:
+            return self.varying(points)
+        return [dr.opaque(self.field.types.Float, a) for a in self.albedo]
 
 
 @dataclass(frozen=True)
@@ -202,7 +212,6 @@ def scatter(
     """
     types = cloud.field.types
     channel_count = len(cloud.albedo)
-    albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
     if cloud.exact > 1 and cloud.scattering is not None:
         for c, value in enumerate(single_scattering(replace(cloud, scattering=None), lights, points, w, numbers)):
             dr.scatter(result.direct[c], value * opacity, lanes)
@@ -220,12 +229,13 @@ def scatter(
         if len(queries):
             assert cloud.scattering is not None
             different = tuple(sorted(set(cloud.albedo)))
+            columns = [different.index(a) for a in cloud.albedo] if cloud.varying is None else range(channel_count)
             counts.queries += len(queries) * len(different)
             counts.skipped += (len(lanes) - len(queries)) * len(different)
             j = cloud.scattering(take(points), take(w), take(omega), cloud.phase, different, take(tau))
-            for c in range(channel_count):
-                value = lanes_of(types.Float, j[:, different.index(cloud.albedo[c])])
-                value = value * (albedo[c] * albedo[c] * (0.25 / dr.pi)) * weight * take(radiance[c])
+            for c, (column, albedo) in enumerate(zip(columns, cloud.albedo_at(take(points)), strict=True)):
+                own = albedo if cloud.varying is not None else albedo * albedo
+                value = lanes_of(types.Float, j[:, column]) * (own * (0.25 / dr.pi)) * weight * take(radiance[c])
                 dr.scatter_add(result.indirect[c], value, target)
 
     direct = single_scattering(cloud, lights, points, w, numbers, None if cloud.scattering is None else predict)
@@ -280,8 +290,8 @@ def scatter_on(
     counts.queries += own.queries
     counts.skipped += own.skipped
     target = dr.gather(types.UInt32, lanes, follow)
-    for c, albedo in enumerate(cloud.albedo):
-        value = (light.direct[c] + light.indirect[c]) * (weight * dr.opaque(types.Float, albedo))
+    for c, albedo in enumerate(cloud.albedo_at(origin)):
+        value = (light.direct[c] + light.indirect[c]) * (weight * albedo)
         dr.scatter_add(result.indirect[c], value, target)
 
 
@@ -304,7 +314,7 @@ def single_scattering(
     """
     types, medium = cloud.field.types, cloud.field
     channel_count, n = len(cloud.albedo), dr.width(points)
-    albedo = [dr.opaque(types.Float, a) for a in cloud.albedo]
+    albedo = cloud.albedo_at(points)
     lobes = [dr.opaque(types.Float, v) for v in cloud.phase]
     direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
     jitter = numbers.number(stratified.SHADOW)

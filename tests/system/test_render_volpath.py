@@ -1,7 +1,8 @@
 """Rationale: with Monte Carlo walks in the network's place the renderer has no bias of its own, so Mitsuba's volpath is its oracle.
 
 Expected behaviour: means of the image and of 16 tiles agree with volpath within their standard errors, and the standard errors are
-small enough for the agreement to say something; under a sun, a uniform sky, a turned environment map, above a floor, inside the cloud.
+small enough for the agreement to say something; under a sun, a uniform sky, a turned environment map, above a floor, inside the cloud, with
+an albedo that varies.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class Scene:
     slack: float = 0.0
     density: str = "ball"
     inside: bool = False
+    varying: bool = False
 
 
 SCENES = {
@@ -68,6 +70,10 @@ SCENES = {
     "single, floor and ball": Scene(SUN + CONSTANT, FLOOR.format(0.5) + BALL, max_depth=2),
     "single, floor under a map": Scene(MAP, FLOOR.format(0.5) + BALL, max_depth=2),
     "homogeneous": Scene(SUN, density="homogeneous"),
+    "varying albedo": Scene(SUN, varying=True),
+    "varying albedo under a map": Scene(MAP, varying=True, g=-0.3),
+    "varying albedo, single": Scene(SUN + CONSTANT, varying=True, max_depth=2),
+    "varying albedo over a floor": Scene(SUN, FLOOR.format(0.5), varying=True, slack=0.01),
     "dark floor": Scene(SUN, FLOOR.format(0.0)),
     "floor": Scene(SUN, FLOOR.format(0.5), slack=0.01),
     "floor under a map": Scene(MAP, FLOOR.format(0.5), slack=0.01),
@@ -85,7 +91,11 @@ def _xml(scene: Scene) -> str:
         if scene.density == "ball"
         else '<medium type="homogeneous" id="cloud"><float name="sigma_t" value="1.5"/>'
     )
-    medium += f'<rgb name="albedo" value="{scene.albedo}"/><phase type="hg"><float name="g" value="{scene.g}"/></phase></medium>'
+    if scene.varying:
+        medium += f'<volume type="gridvolume" name="albedo">{sigma_t.replace("density", "albedo")}{turn}</transform></volume>'
+    else:
+        medium += f'<rgb name="albedo" value="{scene.albedo}"/>'
+    medium += f'<phase type="hg"><float name="g" value="{scene.g}"/></phase></medium>'
     # volpath believes a camera to stand in the medium when it is told so; we look where it stands.
     inside = '<ref id="cloud"/>' if scene.inside else ""
     return f"""<scene version="3.0.0">
@@ -109,13 +119,18 @@ def _xml(scene: Scene) -> str:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, mi: ModuleType) -> Path:
     """Grid and sky that the scenes refer to."""
     path = tmp_path_factory.mktemp("volpath")
+    mi.set_variant("scalar_rgb")
     z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in (9, 10, 12)), indexing="ij")
     # Nothing about it is symmetric: a flipped or turned grid shows.
     density = np.clip(1.1 - np.sqrt((x - 0.2) ** 2 + (1.3 * y) ** 2 + (z + 0.1) ** 2), 0, 1) * (1.2 + x + 0.5 * z)
     write_vol(path / "density.vol", Volume.from_box(np.maximum(density, 0).astype(np.float32), (-1, -1, -1), (1, 1, 1)))
+    # Finer than the density along one axis, coarser along another, and different in every colour.
+    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in (5, 16, 3)), indexing="ij")
+    albedo = np.stack([0.75 + 0.25 * x, 0.6 + 0.4 * np.sin(5 * y), np.where(z > 0.1, 1, 0.2)], axis=-1).astype(np.float32)
+    mi.VolumeGrid(albedo).write(str(path / "albedo.vol"))
     sky = np.random.default_rng(1).random((16, 32, 3)).astype(np.float32)
     sky[3:5, 20:22] = (30, 25, 20)
     write_exr(path / "sky.exr", {c: sky[..., i] for i, c in enumerate("RGB")})

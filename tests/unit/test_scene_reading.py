@@ -42,6 +42,7 @@ def folder(tmp_path: Path, mi: Any) -> Path:
     density = np.random.default_rng(3).random((5, 6, 7)).astype(np.float32)
     mi.VolumeGrid(density[..., None]).write(str(tmp_path / "density.vol"))
     mi.VolumeGrid(np.random.default_rng(4).random((5, 6, 7, 3)).astype(np.float32)).write(str(tmp_path / "colours.vol"))
+    mi.VolumeGrid(np.full((2, 2, 2, 3), 1.5, np.float32)).write(str(tmp_path / "bright.vol"))
     return tmp_path
 
 
@@ -57,6 +58,11 @@ def cloud(
     """A container with a heterogeneous medium, the grid in its box unless `grid_turn` places it elsewhere."""
     grid = GRID.format(turn=PLACE + (turn if grid_turn is None else grid_turn), extra=extra)
     return CLOUD.format(shape=shape, turn=turn, bsdf=bsdf, medium=MEDIUM.format(grid=grid, albedo=albedo, phase=phase))
+
+
+def tint(turn: str = "", file: str = "colours.vol") -> str:
+    """An albedo on a grid of its own."""
+    return GRID.format(turn=PLACE + turn, extra="").replace("sigma_t", "albedo").replace("density.vol", file)
 
 
 def load(mi: Any, folder: Path, content: str, camera: str = CAMERA.format(film=BOX)) -> Any:
@@ -275,10 +281,9 @@ REFUSED = {
         cloud() + '<shape type="sphere"><bsdf type="null"/><medium type="homogeneous" name="exterior"/></shape>',
         "has a medium outside",
     ),
-    "varying albedo": (
-        cloud(albedo=GRID.replace("sigma_t", "albedo").format(turn=PLACE, extra="")),
-        "albedo varies",
-    ),
+    "two clouds of varying albedo": (cloud(albedo=tint()) + cloud(AWAY, albedo=tint(AWAY)), "an albedo that varies in space"),
+    "albedo elsewhere": (cloud(albedo=tint('<translate x="0.3"/>')), "cannot place the grid of the albedo"),
+    "albedo above one": (cloud(albedo=tint(file="bright.vol")), "values outside of 0 to 1"),
     "nearest": (cloud(extra='<string name="filter_type" value="nearest"/>'), "filter_type"),
     "container too small": (cloud('<scale value="0.6"/>', grid_turn=""), "cuts the cloud"),
     "sphere too small": (cloud(shape="sphere", grid_turn=""), "cuts the cloud"),
@@ -303,6 +308,23 @@ def test_refusals_name_what_they_refuse(mi: Any, folder: Path, name: str) -> Non
     with pytest.raises(InputError) as caught:
         read_scene(scene)
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["colours.vol", "density.vol"])
+def test_an_albedo_that_varies_is_read_where_the_medium_has_it(mi: Any, folder: Path, file: str) -> None:
+    turn = '<rotate y="1" angle="90"/><scale x="1.3" y="0.8" z="0.9"/><translate x="0.2"/>'
+    scene = load(mi, folder, cloud(turn, albedo=tint(turn, file)))
+    read = read_scene(scene)
+    assert read.varying is not None
+    assert read.albedo == read.varying.largest
+    medium = scene.shapes()[0].interior_medium()
+    matrix = read.volume.to_world
+    points = np.random.default_rng(8).uniform(0.01, 0.99, (200, 3)) @ matrix[:3, :3].T + matrix[:3, 3]
+    interaction = dr.zeros(mi.MediumInteraction3f, len(points))
+    interaction.p = mi.Point3f(points.T.astype(np.float32))
+    interaction.medium = mi.MediumPtr(medium)
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction)
+    np.testing.assert_allclose(read.varying.sample(points), (np.array(sigma_s) / np.array(sigma_t)).T, atol=2e-4)
 
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic", "thinlens"])
