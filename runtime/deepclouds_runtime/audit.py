@@ -28,7 +28,7 @@ _LOOKED_AT = 1 << 16
 # Walks of the first round; every further round has as many walks as all before, the last one what is left.
 _FIRST = 1 << 16
 # Walks by default: so many a pixel, within these limits.
-WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
+WALKS_A_PIXEL, FEWEST, MOST = 8, 1 << 18, 1 << 22
 # Standard deviations of an interval of 95 %.
 _INTERVAL = 1.96
 # Channels whose ratio at the points differs by less than this are corrected as one.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds_runtime.result import COLOURS, LAYERS, Image
+from deepclouds_runtime.thrown import ThrownLight
 
 
 class Film:
@@ -18,6 +19,8 @@ class Film:
     ----------
     size
         (width, height), pixels.
+    thrown
+        part of the layer ``surface`` that is kept apart, to be smoothed; None smooths nothing.
 
     Attributes
     ----------
@@ -25,8 +28,8 @@ class Film:
         (pixels,) samples of each pixel.
     """
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        self.size = size
+    def __init__(self, size: tuple[int, int], thrown: ThrownLight | None = None) -> None:
+        self.size, self.thrown = size, thrown
         self.pixels = size[0] * size[1]
         self.taken = np.zeros(self.pixels, np.float32)
         self._sums: dict[str, Image] = {}
@@ -45,6 +48,8 @@ class Film:
         for layer in LAYERS:
             if layer in self._sums:
                 total += self._sums[layer]
+        if self.thrown is not None:
+            total += self.thrown.smoothed()
         total /= np.maximum(self.taken, 1)[:, None]
         return total
 
@@ -52,6 +57,8 @@ class Film:
         """All channels (h, w) of an image of which every pixel has a sample."""
         width, height = self.size
         means = {name: values / self.taken[:, None] for name, values in self._sums.items()}
+        if self.thrown is not None:
+            means["surface"] = means["surface"] + self.thrown.smoothed() / self.taken[:, None]
         channels: dict[str, Image] = {}
         for layer in LAYERS:
             values = np.broadcast_to(means.get(layer, np.zeros((self.pixels, 3), np.float32)), (self.pixels, 3))

@@ -28,7 +28,8 @@ from deepclouds_runtime.lights import Environment
 from deepclouds_runtime.result import Image
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.surfaces import reflected, reflected_from_cloud
+from deepclouds_runtime.surfaces import diffuse_share, reflected, reflected_from_cloud
+from deepclouds_runtime.thrown import ThrownLight
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
 # Noise of a pixel that the fast mode aims at, over the mean.
@@ -46,6 +47,9 @@ _BEAMS, _BRIGHT = 48, 0.1
 _BEAMS_THROWN = 12
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
+# Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
+# of which sees many places.
+_CORRECTED, _THROWN = 1.6, 4.0
 # Collisions of a camera ray that get shadow rays.
 _DEPTHS = 4
 
@@ -151,8 +155,9 @@ class Frame:
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
             for source, _ in self.on_surfaces.sources:
                 lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, 2 * tolerance, _BUDGET // 4)
+            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4)
             self.counts.queries += self.all_round.queries
+            self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
         self.spent("light on surfaces", clock)
 
     def _pilot(self, most: int) -> tuple[Any, Stratified]:
@@ -164,8 +169,18 @@ class Frame:
         one = dr.opaque(self.types.UInt32, 1)
         return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
 
-    def prepare(self, tolerance: float, quick: bool = False) -> None:
-        """Predict multiple scattering for this camera; from then on camera rays ask no network. `quick`: at an eighth of the nodes."""
+    def prepare(self, tolerance: float, quick: bool = False, corrected: bool = False) -> None:
+        """Predict multiple scattering for this camera; from then on camera rays ask no network.
+
+        Parameters
+        ----------
+        tolerance
+            of the interpolation at a point, root of the mean square over the mean.
+        quick
+            at an eighth of the nodes.
+        corrected
+            walks will correct what is predicted for suns, and with it what the interpolation errs: fewer nodes do.
+        """
         clock = time.perf_counter()
         pixel, numbers = self._pilot(_PILOT // 4 if quick else _PILOT)
         origin, direction, end = self._camera_rays(pixel, numbers)
@@ -181,9 +196,13 @@ class Frame:
         power = sum(max(light.irradiance) for light in around)
         suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
         around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
+        # Errors of both are independent: each may be the larger the less light it has.
+        parts = [sum(max(light.irradiance) for light in lights) for lights in (suns, around)]
+        of_suns, of_around = (tolerance / math.sqrt(max(part / max(sum(parts), 1e-30), 1e-6)) for part in parts)
+        of_suns *= _CORRECTED if corrected else 1.0
         found = {
-            "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, tolerance, _BUDGET),
-            "light from all around": frame_source(self.cloud, around, [self.camera], seen, wide * _ROOT_AROUND, tolerance, _BUDGET),
+            "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, of_suns, _BUDGET),
+            "light from all around": frame_source(self.cloud, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET),
         }
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
@@ -288,6 +307,12 @@ class Frame:
             if self.interreflection:
                 weight = dr.select(shown, through, 0)
                 thrown = reflected_from_cloud(self.thrower, self.on_cloud, interaction, weight, numbers, self.counts)
+                if self.film.thrown is not None:
+                    share, matt = diffuse_share(types, interaction)
+                    lit, even = ([value * through for value in values] for values in (thrown, share))
+                    place, normal = plain(types, interaction.p), plain(types, interaction.n)
+                    self.film.thrown.add(*where, lit, even, place, normal, matt & shown)
+                    thrown = [dr.select(matt & shown, 0, value) for value in thrown]
                 colours = [a + b for a, b in zip(colours, thrown, strict=True)]
             self.film.add(*where, "surface", [value * through for value in colours])
             behind = dr.select(shown, 0, through)

@@ -249,7 +249,7 @@ class Renderer:
             partial(self._result(look, started, None, False))
             frame.counts.queries += look.counts.queries
             frame.spent("quick look", clock)
-        if not self._prepared(frame, lights, error, interrupted):
+        if not self._prepared(frame, lights, error, correct, interrupted):
             look = self._quick_look(frame, lights)
             look.round(0, 1, most, None)
             return self._result(look, started, None, False)
@@ -268,7 +268,7 @@ class Renderer:
             noise, stopped = rounds_for_error(frame, most, None if timed else error, error, end, not self._walks, watch, so_far)
         return self._result(frame, started, noise, not stopped)
 
-    def _prepared(self, frame: Frame, lights: Lights, error: float, interrupted: Callable[[], bool] | None) -> bool:
+    def _prepared(self, frame: Frame, lights: Lights, error: float, correct: bool, interrupted: Callable[[], bool] | None) -> bool:
         """Predict what the frame interpolates, and see what surfaces send to the cloud; False where somebody stopped it."""
         adaptive = self.mode == "fast" and not self._walks
         try:
@@ -282,7 +282,7 @@ class Renderer:
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
             if self.mode == "fast" and not frame.sampled:
-                frame.prepare(_INTERPOLATION * error)
+                frame.prepare(_INTERPOLATION * error, corrected=correct)
         except Stopped:
             return False
         finally:

@@ -149,6 +149,16 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
     return [t * (s + j) for t, s, j in zip(throughput, light.direct, light.indirect, strict=True)]
 
 
+def diffuse_share(types: Any, interaction: Any) -> tuple[list[Any], Any]:
+    """Share of even light that surfaces send back, one Float a channel, and Bool: whether they are matt, alike in all directions."""
+    mi = mitsuba()
+    bsdf, valid = interaction.bsdf(), interaction.is_valid()
+    flags = bsdf.flags()
+    shiny = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
+    share = channels(types, bsdf.eval_diffuse_reflectance(interaction, valid))
+    return share, plain(types, valid & ~shiny)
+
+
 class Reflectors:
     """The surfaces around a cloud as a light source: what they reflect reaches the cloud's samples.
 
