@@ -26,9 +26,11 @@ _DARK = 0.02
 # Points at which a correction is looked at to judge it.
 _LOOKED_AT = 1 << 16
 # Walks of the first round; every further round has as many walks as all before, the last one what is left.
-_FIRST = 1 << 16
+_FIRST = 1 << 18
 # Walks by default: so many a pixel, within these limits.
-WALKS_A_PIXEL, FEWEST, MOST = 8, 1 << 18, 1 << 22
+WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
+# Where what is left is still so many times what was asked for, walks go on to so many times their number.
+_FAR, _FURTHER = 1.25, 3
 # Standard deviations of an interval of 95 %.
 _INTERVAL = 1.96
 # Channels whose ratio at the points differs by less than this are corrected as one.
@@ -203,7 +205,7 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
     error
         the error to stop at.
     most
-        most walks.
+        most walks; in order to correct, three times as many, up to `MOST`, where what is left is then still above 1.25 times `error`.
     more
         is asked between rounds whether to go on.
 
@@ -214,13 +216,18 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
     audit.extend(min(_FIRST, most))
     if not audit.count:
         return Outcome(list(sources), {})
+    limit = most
     while True:
         before = audit.before()
         reached = audit.remaining() if correct else before
-        # A last round that adds little tells nothing new.
-        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2 or 1.1 * audit.count > most or not more():
+        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2 or not more():
             break
-        audit.extend(min(audit.count, most - audit.count))
+        if correct and 1.1 * audit.count > limit and reached.squared > (_FAR * error) ** 2:
+            limit = min(_FURTHER * most, max(MOST, most))
+        # A last round that adds little tells nothing new.
+        if 1.1 * audit.count > limit:
+            break
+        audit.extend(min(audit.count, limit - audit.count))
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}
     if correct:
         correction = audit.correction()
