@@ -17,7 +17,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds_runtime.frame_source import Arriving, FrameSource, Seen, frame_source
+from deepclouds_runtime.audit_walks import Walks
+from deepclouds_runtime.correction import FLOOR
+from deepclouds_runtime.frame_source import Arriving, FrameSource, Seen, frame_source, upload
+from deepclouds_runtime.lights import on_host
 from deepclouds_runtime.transport import Cloud
 
 Array = NDArray[Any]
@@ -45,8 +48,10 @@ class AllRound:
         the medium; its `scattering` is the network.
     lights
         where light comes from.
-    seen
-        points of the cloud that surfaces see.
+    seen, along
+        points of the cloud that surfaces see, and the directions (n, 3) in which they see them.
+    counts
+        (n,) how much the light from there counts in the image.
     root, tolerance, budget
         see `frame_source`.
 
@@ -56,17 +61,34 @@ class AllRound:
         harmonics of J at the nodes, or None where it is 0 everywhere.
     queries
         asked of the network.
+    factor
+        of each colour channel, by which J is multiplied; 1 until walks say better.
+    seen, along, counts
+        as given.
+    again
+        J under further lights, which is added.
     """
 
-    def __init__(self, cloud: Cloud, lights: Sequence[Arriving], seen: Seen, root: float, tolerance: float, budget: int) -> None:
+    def __init__(
+        self, cloud: Cloud, lights: Sequence[Arriving], seen: Seen, along: Array, counts: Array, root: float, tolerance: float, budget: int
+    ) -> None:
         self.source: FrameSource | None = frame_source(
             cloud, lights, [Direction(w) for w in spread(DIRECTIONS)], seen, root, tolerance, budget, fit, _HARMONICS
         )
         self._channels, self._types = len(cloud.albedo), cloud.field.types
         self.queries = 0 if self.source is None else self.source.queries
+        self.seen, self.along, self.counts = seen, along, counts
+        self.again: AllRound | None = None
+        self.factor = np.ones(self._channels)
 
     def __call__(self, points: Any, w: Any) -> list[Any]:
         """J of every colour channel at points (Array3f) seen along unit vectors `w`."""
+        total = self._own(points, w)
+        if self.again is not None:
+            total = [a + b for a, b in zip(total, self.again(points, w), strict=True)]
+        return [value * dr.opaque(self._types.Float, float(f)) for value, f in zip(total, self.factor, strict=True)]
+
+    def _own(self, points: Any, w: Any) -> list[Any]:
         if self.source is None:
             return [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
         octree = self.source.octree
@@ -77,6 +99,30 @@ class AllRound:
             terms = [b * v for b, v in zip(basis, values[f * _HARMONICS : (f + 1) * _HARMONICS], strict=True)]
             sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
         return self.source.colours(sums)
+
+    def correct(self, walks: Walks, count: int, seed: int) -> dict[str, Any]:
+        """Set `factor` by `count` walks from points that surfaces see; returns it and its standard deviation, for a report.
+
+        The factor is the ratio of the means of what walks find and of what is predicted, drawn toward 1 as far as chance explains it.
+        """
+        points, along, weights = self.seen.points, self.along, self.seen.weights * self.counts
+        if self.source is None or not weights.sum() > 0:
+            return {}
+        x, w = upload(self._types, points), upload(self._types, along)
+        predicted = on_host(self(x, w), len(points))
+        level = predicted.mean(axis=1)
+        wanted = weights * (level + max(FLOOR * float(np.average(level, weights=weights)), 1e-30))
+        total = np.cumsum(wanted)
+        random = np.random.default_rng([seed & 0xFFFFFFFF, 0x7420])
+        place = (np.arange(count) + random.random()) / count * total[-1]
+        drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
+        found = walks.walked(points[drawn], along[drawn], int(random.integers(1 << 32)), random)
+        each = (weights[drawn] * (total[-1] / wanted[drawn]))[:, None]
+        below = np.maximum((each * predicted[drawn]).mean(axis=0), 1e-30)
+        residual = each * (found - predicted[drawn]) / below
+        mean, variance = residual.mean(axis=0), residual.var(axis=0) / count
+        self.factor = self.factor * np.maximum(1 + mean * np.maximum(1 - variance / np.maximum(np.square(mean), 1e-30), 0), 0)
+        return {"factor": [round(float(f), 5) for f in self.factor], "deviation": [round(float(v), 5) for v in np.sqrt(variance)]}
 
 
 def spread(count: int) -> Array:

@@ -109,10 +109,10 @@ class Walks:
         drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
         weights = share[drawn] * (total[-1] / wanted[drawn])
         points, of_ray = seen.points[drawn], seen.rays[drawn]
-        walked = self._walked(points, along[of_ray], key, random)
+        walked = self.walked(points, along[of_ray], key, random)
         return Batch(points, chosen[of_ray], weights, predicted[drawn], walked)
 
-    def _walked(self, points: Array, along: Array, key: int, random: np.random.Generator) -> Array:
+    def walked(self, points: Array, along: Array, key: int, random: np.random.Generator) -> Array:
         """J (n, channels) of one walk a point, under every sun and a few directions of each other light."""
         cloud, n = self._cloud, len(points)
         toward, arriving = self._arriving(points, key, random)

@@ -18,6 +18,7 @@ from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import Adaptive
 from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
+from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import confidence, relative_errors
 from deepclouds_runtime.disc import background, looks_into
@@ -43,13 +44,15 @@ _PILOT, _PILOT_DEPTHS = 1 << 16, 4
 _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
 _BEAMS, _BRIGHT = 48, 0.1
-# The same for light that the cloud throws on surfaces.
-_BEAMS_THROWN = 12
+# The same for light that the cloud throws on surfaces, and for that of surfaces which it throws back to them.
+_BEAMS_THROWN, _BEAMS_BACK = 12, 3
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
 # of which sees many places.
 _CORRECTED, _THROWN = 1.6, 4.0
+# Walks that correct the light thrown on surfaces, by a single number.
+_WALKS_THROWN = 1 << 17
 # Collisions of a camera ray that get shadow rays.
 _DEPTHS = 4
 
@@ -152,12 +155,32 @@ class Frame:
             o, d = (types.Array3f(*(lanes_of(types.Float, v[:, c]) for c in range(3))) for v in (places, ahead))
             end = dr.full(types.Float, math.inf, len(places))
             seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
+            # Light on what the camera sees counts in the image, by the cloud's size as seen from there.
+            counts = np.square(radius / np.maximum(np.linalg.norm(places - 0.5 * (lower + upper), axis=1), radius))
+            counts[len(parts[0][0]) :] = 0
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
             for source, _ in self.on_surfaces.sources:
                 lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            self.all_round = AllRound(self.cloud, lights, seen, _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4)
+            self.all_round = AllRound(
+                self.cloud, lights, seen, ahead[seen.rays], counts[seen.rays], _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4
+            )
             self.counts.queries += self.all_round.queries
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
+        self.spent("light on surfaces", clock)
+
+    def prepare_thrown_back(self, tolerance: float) -> None:
+        """The same for what surfaces send to the cloud, and it back to them: once, in the light that `on_cloud` has of them."""
+        first = self.all_round
+        if first is None:
+            return
+        clock = time.perf_counter()
+        lights: list[Arriving] = []
+        for source, _ in self.on_cloud.sources[len(self.on_surfaces.sources) :]:
+            lights += from_source(self.types, source, _BEAMS_BACK, False, self.seed)
+        # A fraction of a fraction of the light.
+        wide = 2 * _THROWN * tolerance
+        first.again = AllRound(self.cloud, lights, first.seen, first.along, first.counts, _ROOT_AROUND, wide, _BUDGET // 4)
+        self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
     def _pilot(self, most: int) -> tuple[Any, Stratified]:
@@ -226,6 +249,9 @@ class Frame:
 
         outcome = audited(found, self.sources, correct, error, most, more)
         self.sources, self.found = outcome.sources, outcome.found
+        if correct and self.all_round is not None and more():
+            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
+            self.found = {**self.found, "thrown": self.all_round.correct(walks, _WALKS_THROWN, self.seed)}
         self.spent("audit", clock)
 
     def _camera_rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any]:

@@ -60,7 +60,7 @@ class Beam:
     omega
         unit vector TOWARD it.
     solid_angle
-        of the part, steradians.
+        of the part, as far as it is not black, steradians.
     irradiance
         perpendicular to `omega`, one value a colour channel.
     """
@@ -198,7 +198,9 @@ class Environment:
             if length == 0:
                 continue
             x, y, z = (float(v) for v in middle / length)
-            beams.append(Beam((x, y, z), float(solid[part].sum()), tuple(float(v) for v in energy[part].sum(axis=(0, 1)))))
+            # What is black is no part of it: of a floor up to the horizon, say, a rectangle has the sky above it as well.
+            lit = float(solid[part][weight[part] > 0].sum())
+            beams.append(Beam((x, y, z), lit, tuple(float(v) for v in energy[part].sum(axis=(0, 1)))))
         return beams
 
     def arriving_beam(self, points: Any, beam: Beam, numbers: Stratified) -> list[Any]:

@@ -281,6 +281,7 @@ class Renderer:
                 reflectors = Reflectors(frame.thrower, lights, frame.seed & 0xFFFFFFFF, frame.counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
+                frame.prepare_thrown_back(_INTERPOLATION * error)
             if self.mode == "fast" and not frame.sampled:
                 frame.prepare(_INTERPOLATION * error, corrected=correct)
         except Stopped:
