@@ -64,23 +64,16 @@ generate = parts=$$(nproc); running=""; \
   done; \
   for process in $$running; do wait $$process || exit; done
 
-# A run of configs/NAME.toml, from its beginning or from where it was interrupted.
-train = if [ -e work/$(1)_run/checkpoint.pt ]; then how=--resume; else how=configs/$(1).toml; fi; \
-  $(BIN)/deepclouds train $$how -o work/$(1)_run
-
 # Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
 	$(call generate,configs/labels.toml -o work/labels)
-	$(call generate,configs/blocks_labels.toml -o work/blocks_labels)
-	$(call generate,configs/pairs_labels.toml -o work/pairs_labels)
 	$(call generate,configs/valid_halves_labels.toml -o work/valid_halves)
-	[ -e work/all_labels/manifest.json ] || $(BIN)/deepclouds dataset merge work/labels work/blocks_labels work/pairs_labels -o work/all_labels
-	$(call train,accurate)
-	$(call train,final)
-	$(BIN)/deepclouds export work/final_run -o work/accurate.onnx
-	$(BIN)/deepclouds export work/final_run --companion -o work/fast.onnx
+	if [ -e work/accurate_run/checkpoint.pt ]; then how=--resume; else how=configs/accurate.toml; fi; \
+	  $(BIN)/deepclouds train $$how -o work/accurate_run
+	$(BIN)/deepclouds export work/accurate_run -o work/accurate.onnx
+	$(BIN)/deepclouds export work/accurate_run --companion -o work/fast.onnx
 	for model in accurate fast; do \
-	  $(BIN)/deepclouds calibrate work/$$model.onnx --data work/all_labels --labels work/valid_halves || exit; \
+	  $(BIN)/deepclouds calibrate work/$$model.onnx --data work/labels --labels work/valid_halves || exit; \
 	done
 
 # The training labels and the held-out ones that a model is judged by; a tenth of the latter once more by Mitsuba's volpath.

@@ -24,7 +24,7 @@ from deepclouds_runtime.confidence import confidence, relative_errors
 from deepclouds_runtime.disc import background, looks_into
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.film import Film
-from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_source, from_suns, seen_by
+from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_beams, from_source, from_suns, seen_by
 from deepclouds_runtime.lights import Environment
 from deepclouds_runtime.result import Image
 from deepclouds_runtime.scene import CloudScene
@@ -45,7 +45,7 @@ _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
 _BEAMS, _BRIGHT = 48, 0.1
 # The same for light that the cloud throws on surfaces, and for that of surfaces which it throws back to them.
-_BEAMS_THROWN, _BEAMS_BACK = 12, 3
+_BEAMS_THROWN, _BEAMS_BACK = 12, 4
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
@@ -176,7 +176,8 @@ class Frame:
         clock = time.perf_counter()
         lights: list[Arriving] = []
         for source, _ in self.on_cloud.sources[len(self.on_surfaces.sources) :]:
-            lights += from_source(self.types, source, _BEAMS_BACK, False, self.seed)
+            # Of so few parts, what one point sees in the middle is a poor measure: a shadow there would stand for all.
+            lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.
         wide = 2 * _THROWN * tolerance
         first.again = AllRound(self.cloud, lights, first.seen, first.along, first.counts, _ROOT_AROUND, wide, _BUDGET // 4)

@@ -199,6 +199,18 @@ def from_source(types: Any, source: LightSource, count: int, plain: bool, seed: 
     return [of(beam) for beam in source.beams(count) if max(beam.irradiance) > 0]
 
 
+def from_beams(types: Any, source: LightSource, count: int) -> list[Arriving]:
+    """A light from all around as `count` directions, each as bright at every point as the source's table has its part."""
+
+    def of(beam: Beam) -> Arriving:
+        def at(points: Any) -> list[Any]:
+            return [dr.full(types.Float, value, dr.width(points)) for value in beam.irradiance]
+
+        return Arriving(beam.omega, beam.irradiance, at, len(set(beam.irradiance)) == 1)
+
+    return [of(beam) for beam in source.beams(count) if max(beam.irradiance) > 0]
+
+
 def frame_source(
     cloud: Cloud,
     lights: Sequence[Arriving],

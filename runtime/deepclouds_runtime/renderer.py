@@ -201,7 +201,7 @@ class Renderer:
             walks are spent as the error is worth.
         correct
             audit, and correct the network's multiple scattering by what the walks say, where they say that it helps. The light that the
-            cloud throws on surfaces is not corrected.
+            cloud throws on surfaces is corrected by one number a channel.
         time_limit
             seconds: the audit ends after half of them, sampling with the last round that should end in time. The result then depends on the
             machine.

@@ -105,6 +105,44 @@ def test_a_wrong_network_is_found_out_and_corrected(scene: Path, monkeypatch: py
     assert np.isfinite(right.rgb).all()
 
 
+FLOOR = (
+    '<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/><translate y="-1.1"/></transform>'
+    '<bsdf type="diffuse"><rgb name="reflectance" value="0.9"/></bsdf></shape></scene>'
+)
+
+
+@pytest.fixture
+def floor(scene: Path) -> Path:
+    """The same cloud over a white floor."""
+    path = scene.with_name("floor.xml")
+    path.write_text(scene.read_text().replace("</scene>", FLOOR).replace('origin="1.2, 1, 3.6"', 'origin="1.2, 3, 3.6"'))
+    return path
+
+
+def _on_floor(image: RenderResult) -> Array:
+    """Light of the floor's open part, by quarters of the image, (quarters,)."""
+    surface = image.channels["surface.G"].astype(np.float64) * (image.channels["volume_opacity"] < 0.01)
+    quarters: Array = surface.reshape(2, SIZE // 2, 2, SIZE // 2).mean(axis=(1, 3)).ravel()
+    return quarters
+
+
+def test_light_on_surfaces_is_that_of_paths_and_corrected_by_a_factor(floor: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paths have the light that the floor sends to the cloud, and it back to the floor, by themselves."""
+    paths = load(floor, unbiased=True).render(1024, 3)
+    found, wrong = (rendered(floor, monkeypatch, kind) for kind in ("none", "constant"))
+    np.testing.assert_allclose(_on_floor(found), _on_floor(paths), rtol=0.02)
+    # What harmonics and nodes err is corrected too, whether the network is right or not.
+    right, constant = (rendered(floor, monkeypatch, kind, correct=True) for kind in ("none", "constant"))
+    ours, theirs = (image.statistics.audit["thrown"] for image in (right, constant))
+    for a, b, deviation in zip(ours["factor"], theirs["factor"], theirs["deviation"], strict=True):
+        assert 1.3 * b / a == pytest.approx(1, abs=0.02 + 6 * deviation)
+        assert 0 < deviation < 0.02
+    # A third more of what is thrown is two percent of the light on the floor, most of which is the sun's.
+    off, left = (abs(_on_floor(a).sum() / _on_floor(b).sum() - 1) for a, b in ((wrong, found), (constant, right)))
+    assert off > 0.01
+    assert left < 0.3 * off
+
+
 def test_a_network_that_is_right_stays_as_it_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With nodes so close that interpolation is right as well: what it errs is corrected too."""
     true = rendered(scene, monkeypatch, "exact", error=0.01)
