@@ -250,7 +250,7 @@ class Frame:
 
         outcome = audited(found, self.sources, correct, error, most, more)
         self.sources, self.found = outcome.sources, outcome.found
-        if correct and self.all_round is not None and more():
+        if correct and self.found and self.all_round is not None and more():
             walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
             self.found = {**self.found, "thrown": self.all_round.correct(walks, _WALKS_THROWN, self.seed)}
         self.spent("audit", clock)
