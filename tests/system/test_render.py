@@ -221,10 +221,10 @@ def test_a_seed_gives_one_image(folder: Path) -> None:
 
 
 def test_passes_do_not_show(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from deepclouds_runtime import renderer
+    from deepclouds_runtime import frame
 
     whole = load(folder / "scene.xml", predictor=Constant()).render(4, seed=1)
-    monkeypatch.setattr(renderer, "_PASS", 4 * 31)
+    monkeypatch.setattr(frame, "_PASS", 4 * 31)
     shares: list[float] = []
     parts = load(folder / "scene.xml", predictor=Constant()).render(4, seed=1, progress=shares.append)
     assert _close(whole, parts)
