@@ -77,7 +77,9 @@ def rounds_for_error(
     watch, so_far
         who is told, and the image so far from its noise.
     """
-    _say_ignored(error, int(frame.scene.sensor.sampler().sample_count()))
+    # Paths that nobody asked for stop at the scene's own number.
+    if (own := int(frame.scene.sensor.sampler().sample_count())) != most:
+        _say_ignored(error, own)
     started, noise, growth, pace = time.perf_counter(), math.inf, 2.0, 0.0
     frame.round(0, 1, most, None)
     while frame.samples < most and (target is None or not noise <= target):
