@@ -19,18 +19,19 @@ class Film:
     ----------
     size
         (width, height), pixels.
-    thrown
-        part of the layer ``surface`` that is kept apart, to be smoothed; None smooths nothing.
 
     Attributes
     ----------
     taken
         (pixels,) samples of each pixel.
+    thrown
+        part of the layer ``surface`` that is kept apart, to be smoothed; None smooths nothing.
     """
 
-    def __init__(self, size: tuple[int, int], thrown: ThrownLight | None = None) -> None:
-        self.size, self.thrown = size, thrown
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
         self.pixels = size[0] * size[1]
+        self.thrown: ThrownLight | None = None
         self.taken = np.zeros(self.pixels, np.float32)
         self._sums: dict[str, Image] = {}
 
@@ -44,27 +45,33 @@ class Film:
 
     def beauty(self) -> Image:
         """The image so far (pixels, 3)."""
+        return self._together(self._smoothed())
+
+    def _smoothed(self) -> dict[str, Image]:
+        """The sums, the layer ``surface`` with what is kept apart."""
+        if self.thrown is None:
+            return self._sums
+        return {**self._sums, "surface": self._sums["surface"] + self.thrown.smoothed()}
+
+    def _together(self, sums: dict[str, Image]) -> Image:
         total = np.zeros((self.pixels, 3), np.float32)
         for layer in LAYERS:
-            if layer in self._sums:
-                total += self._sums[layer]
-        if self.thrown is not None:
-            total += self.thrown.smoothed()
+            if layer in sums:
+                total += sums[layer]
         total /= np.maximum(self.taken, 1)[:, None]
         return total
 
     def channels(self) -> dict[str, Image]:
         """All channels (h, w) of an image of which every pixel has a sample."""
         width, height = self.size
-        means = {name: values / self.taken[:, None] for name, values in self._sums.items()}
-        if self.thrown is not None:
-            means["surface"] = means["surface"] + self.thrown.smoothed() / self.taken[:, None]
+        sums = self._smoothed()
+        means = {name: values / self.taken[:, None] for name, values in sums.items()}
         channels: dict[str, Image] = {}
         for layer in LAYERS:
             values = np.broadcast_to(means.get(layer, np.zeros((self.pixels, 3), np.float32)), (self.pixels, 3))
             for c, colour in enumerate(COLOURS):
                 channels[f"{layer}.{colour}"] = np.ascontiguousarray(values[:, c]).reshape(height, width)
-        beauty = self.beauty()
+        beauty = self._together(sums)
         opacity, depth, alpha = (means[name].reshape(height, width) for name in ("volume_opacity", "volume_Z", "A"))
         channels |= {colour: np.ascontiguousarray(beauty[:, c]).reshape(height, width) for c, colour in enumerate(COLOURS)}
         channels["A"] = np.minimum(alpha, 1)

@@ -135,11 +135,14 @@ def locate_albedo(values: NDArray[np.float32], boxes: list[Matrix], volume: Volu
     """
     random = np.random.default_rng(seed)
     filled = np.argwhere(volume.density > 0)
+    # Without any medium every placement agrees.
     if not len(filled):
         return AlbedoGrid(values, boxes[0])
     chosen = filled[random.integers(0, len(filled), 512)][:, ::-1] + random.random((512, 3))
     points = chosen / np.array(volume.resolution) @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
     truth, known = albedo(points)
+    if not known.any():
+        return AlbedoGrid(values, boxes[0])
     worst = np.inf
     for box in boxes:
         for candidate in orientations(box):

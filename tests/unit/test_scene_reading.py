@@ -327,6 +327,12 @@ def test_an_albedo_that_varies_is_read_where_the_medium_has_it(mi: Any, folder: 
     np.testing.assert_allclose(read.varying.sample(points), (np.array(sigma_s) / np.array(sigma_t)).T, atol=2e-4)
 
 
+def test_without_extinction_any_place_of_the_albedo_will_do(mi: Any, folder: Path) -> None:
+    read = read_scene(load(mi, folder, cloud(albedo=tint()).replace('name="scale" value="5"', 'name="scale" value="0"')))
+    assert read.scale == 0
+    assert read.varying is not None
+
+
 @pytest.mark.parametrize("kind", ["perspective", "orthographic", "thinlens"])
 def test_cameras_and_crop_windows(mi: Any, folder: Path, kind: str) -> None:
     crop = '<integer name="crop_width" value="2"/><integer name="crop_height" value="3"/><integer name="crop_offset_x" value="1"/>'
