@@ -141,8 +141,8 @@ def measure(
             if not entries:
                 print(f"{scene.name}: {label(method, name)} was left out: the model was not trained on such a medium")
             for entry in entries:
-                image = read_exr(folder / entry["file"]).rgb()
-                report = error_report(image, *references, flip=find_spec("flip_evaluator") is not None)
+                image, other = (read_exr(folder / name).rgb() for name in entry["files"])
+                report = error_report(image, *references, second_seed=other, flip=find_spec("flip_evaluator") is not None)
                 seconds = entry["seconds_warm"], entry["seconds_cold"]
                 rows.append(Row(entry["method"], scene.name, entry["spp"], *seconds, report, entry["model"]))
                 print(_line(rows[-1]), flush=True)
@@ -245,7 +245,8 @@ def _line(row: Row) -> str:
     cold = "" if row.seconds_cold is None else f", cold {row.seconds_cold:.3g} s"
     return (
         f"{row.scene:16} {row.label:36} {row.spp_text:>7} spp  {row.seconds_warm:8.3g} s{cold}  "
-        f"rRMSE {100 * r.rrmse:.2f} % [{100 * r.rrmse_interval[0]:.2f}, {100 * r.rrmse_interval[1]:.2f}]  energy {100 * r.energy:+.2f} %"
+        f"rRMSE {100 * r.rrmse:.2f} % [{100 * r.rrmse_interval[0]:.2f}, {100 * r.rrmse_interval[1]:.2f}]  "
+        f"a pixel {100 * row.error:.2f} %  energy {100 * r.energy:+.2f} %"
     )
 
 

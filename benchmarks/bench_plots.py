@@ -48,12 +48,12 @@ def write_plots(folder: Path, rows: Sequence[Row]) -> int:
         for method, model, colour, marker, line in styles:
             size = 9 if marker == "*" else 5
             mine = sorted((r for r in rows if (r.scene, r.method, r.model) == (scene, method, model)), key=lambda r: r.seconds_warm)
-            points = [r for r in mine if r.report.rrmse > 0]
+            points = [r for r in mine if r.error > 0]
             # No logarithm of 0: what cannot be told from it is shown hollow, where its interval ends.
-            exact = [r for r in mine if r.report.rrmse == 0 and r.report.rrmse_interval[1] > 0]
+            exact = [r for r in mine if r.error == 0 and r.interval[1] > 0]
             axis.plot(
                 [r.seconds_warm for r in exact],
-                [100 * r.report.rrmse_interval[1] for r in exact],
+                [100 * r.interval[1] for r in exact],
                 color=colour,
                 marker=marker,
                 ms=size,
@@ -63,17 +63,17 @@ def write_plots(folder: Path, rows: Sequence[Row]) -> int:
             )
             if not points:
                 continue
-            errors = [100 * p.report.rrmse for p in points]
+            errors = [100 * p.error for p in points]
             bars = [
-                [e - 100 * p.report.rrmse_interval[0] for e, p in zip(errors, points, strict=True)],
-                [100 * p.report.rrmse_interval[1] - e for e, p in zip(errors, points, strict=True)],
+                [e - 100 * p.interval[0] for e, p in zip(errors, points, strict=True)],
+                [100 * p.interval[1] - e for e, p in zip(errors, points, strict=True)],
             ]
             bars = [[max(0.0, b) for b in side] for side in bars]
             seconds = [p.seconds_warm for p in points]
             axis.errorbar(
                 seconds, errors, bars, color=colour, marker=marker, ms=size, ls=line, capsize=2, lw=1.2, label=label(method, model)
             )
-        axis.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="rRMSE, %", title=scene)
+        axis.set(xscale="log", yscale="log", xlabel="seconds, warm", ylabel="error of a pixel, %", title=scene)
         axis.grid(which="both", color="#dddddd", lw=0.5)
         axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))
 

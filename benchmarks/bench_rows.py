@@ -47,6 +47,16 @@ class Row:
         """The method in words."""
         return label(self.method, self.model)
 
+    @property
+    def error(self) -> float:
+        """What methods are compared at: the error of a pixel, or, of an image without a second seed, its rRMSE."""
+        return self.report.rrmse if self.report.pixel_error is None else self.report.pixel_error
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Interval of `error`."""
+        return self.report.pixel_error_interval or self.report.rrmse_interval
+
 
 def label(method: str, model: str = "") -> str:
     """A method and its model in words."""
@@ -83,10 +93,10 @@ def compared(rows: Sequence[Row], scene: str, model: str | None = None, method: 
 
 def equal_error(rows: Sequence[Row], ours: Row, error: float | None = None) -> dict[str, Bounded]:
     """Seconds that each peer needs on the scene of `ours` to reach an error (default: that of `ours`)."""
-    target = ours.report.rrmse if error is None else error
+    target = ours.error if error is None else error
     peers: dict[str, Bounded] = {}
     for method, seconds in (("volpath", unbiased_seconds), ("oidn", interpolated_seconds)):
-        timings = [Timing(r.seconds_warm, r.report.rrmse) for r in rows if (r.method, r.scene) == (method, ours.scene)]
+        timings = [Timing(r.seconds_warm, r.error) for r in rows if (r.method, r.scene) == (method, ours.scene)]
         if timings and target > 0 and all(t.error > 0 for t in timings):
             peers[method] = seconds(timings, target)
     return peers
@@ -107,11 +117,11 @@ def speed_ups(rows: Sequence[Row]) -> list[str]:
                 continue
             parts = []
             for method, needed in equal_error(rows, ours).items():
-                low, high = (equal_error(rows, ours, e).get(method) for e in reversed(ours.report.rrmse_interval))
+                low, high = (equal_error(rows, ours, e).get(method) for e in reversed(ours.interval))
                 ends = None if low is None or high is None else (low.over(ours.seconds_warm), high.over(ours.seconds_warm))
                 spread = f" [{ends[0]}, {ends[1]}]" if ends is not None else ""
                 parts.append(f"{needed.over(ours.seconds_warm)} x{spread} against {label(method)} ({needed} s)")
-            reached = f"{scene}: {ours.label} reaches {100 * ours.report.rrmse:.2f} % in {ours.seconds_warm:.3g} s"
+            reached = f"{scene}: {ours.label} reaches {100 * ours.error:.2f} % in {ours.seconds_warm:.3g} s"
             lines.append(f"{reached}; at equal error {'; '.join(parts)}" if parts else f"{reached}; no peer to compare with")
     return lines
 
@@ -150,6 +160,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write one line an image; fractions, not per cent; an empty field is a figure that was not measured."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names = ["method", "model", "scene", "spp", "seconds_warm", "seconds_cold", "rrmse", "rrmse_low", "rrmse_high"]
+    names += ["pixel_error", "pixel_error_low", "pixel_error_high"]
     names += ["energy", "energy_low", "energy_high", "dark_energy", "worst_tile", "flip"]
 
     with replacing(path, ".csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
@@ -158,7 +169,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         for row in rows:
             r = row.report
             cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.6g}"
-            figures = [r.rrmse, *r.rrmse_interval, r.energy, *r.energy_interval, r.dark_energy, r.worst_tile]
+            figures = [r.rrmse, *r.rrmse_interval, row.error, *row.interval, r.energy, *r.energy_interval, r.dark_energy, r.worst_tile]
             texts = [f"{x:.6g}" for x in figures] + ["" if r.flip is None else f"{r.flip:.6g}"]
             writer.writerow([row.method, row.model, row.scene, row.spp_text, f"{row.seconds_warm:.6g}", cold, *texts])
 
@@ -166,8 +177,8 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 def markdown(rows: Sequence[Row]) -> str:
     """Lay the rows out as a table, in per cent, with the time that the peers need to the error of each deepclouds row."""
     lines = [
-        "| scene | method | spp | warm s | cold s | rRMSE % | energy % | worst tile % | FLIP | volpath to the same | OIDN to the same |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| scene | method | spp | warm s | cold s | rRMSE % | a pixel % | energy % | worst tile % | FLIP | volpath to it | OIDN to it |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         r = row.report
@@ -178,6 +189,6 @@ def markdown(rows: Sequence[Row]) -> str:
         cold = "" if row.seconds_cold is None else f"{row.seconds_cold:.3g}"
         flip = "" if r.flip is None else f"{r.flip:.4f}"
         cells = [row.scene, row.label, row.spp_text, f"{row.seconds_warm:.3g}", cold]
-        cells += [interval, energy, f"{100 * r.worst_tile:+.1f}", flip]
+        cells += [interval, f"{100 * row.error:.2f}", energy, f"{100 * r.worst_tile:+.1f}", flip]
         lines.append("| " + " | ".join([*cells, *needed]) + " |")
     return "\n".join(lines)

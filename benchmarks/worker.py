@@ -4,8 +4,8 @@
 
 METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), reference (its method as published: every sample
 asks the network), unbiased (its own path tracer), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its denoised image) or single
-(single scattering). Writes one EXR an image and `METHOD.json`: for each image its method, model, spp, file, seconds warm and seconds cold;
-nothing for a model that was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all
+(single scattering). Writes two EXRs an image, which differ in their seed, and `METHOD.json`: for each image its method, model, spp, files,
+seconds warm and seconds cold; nothing for a model that was not trained on the scene's medium. Warm: scene, kernels and model are loaded, all
 work that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and loading included.
 """
 
@@ -101,12 +101,12 @@ def _twice(
     """Render each spp with two seeds: the first image of all is cold, every second one warm."""
     rows = []
     for index, spp in enumerate(spps):
-        seconds = []
+        seconds, images = [], []
         for repeat in range(2):
             start = time.perf_counter()
-            image = render(spp, seed + 2 * index + repeat)
+            images.append(render(spp, seed + 2 * index + repeat))
             seconds.append(time.perf_counter() - start)
-        rows.append(_row(method, spp, image, seconds[1], loaded + seconds[0] if index == 0 else None, out, model))
+        rows.append(_row(method, spp, images[1], images[0], seconds[1], loaded + seconds[0] if index == 0 else None, out, model))
     return rows
 
 
@@ -133,16 +133,20 @@ def render_peer(method: str, scene: Path, size: int, spps: list[int], seed: int,
         denoise(warm_up, hdr=True)
     rows = []
     for index, spp in enumerate(spps):
-        start = time.perf_counter()
-        image = render(spp, seed + 1 + index)
-        traced = time.perf_counter() - start
-        rows.append(_row("single" if method == "single" else "volpath", spp, image, traced, loading + traced, out))
-        if denoise is not None:
+        traced, filtered, noisy, clean = [], [], [], []
+        for repeat in range(2):
             start = time.perf_counter()
-            # A cloud has no albedo or normal at a first surface; both images would be empty. Colour is all the filter gets.
-            clean = np.array(denoise(image, hdr=True), dtype=np.float32)
-            filtered = traced + time.perf_counter() - start
-            rows.append(_row("oidn", spp, clean, filtered, loading + filtered, out))
+            noisy.append(render(spp, seed + 1 + 2 * index + repeat))
+            traced.append(time.perf_counter() - start)
+            if denoise is not None:
+                start = time.perf_counter()
+                # A cloud has no albedo or normal at a first surface; both images would be empty. Colour is all the filter gets.
+                clean.append(np.array(denoise(noisy[-1], hdr=True), dtype=np.float32))
+                filtered.append(traced[-1] + time.perf_counter() - start)
+        kind = "single" if method == "single" else "volpath"
+        rows.append(_row(kind, spp, noisy[0], noisy[1], traced[0], loading + traced[0], out))
+        if clean:
+            rows.append(_row("oidn", spp, clean[0], clean[1], filtered[0], loading + filtered[0], out))
     return rows
 
 
@@ -165,10 +169,12 @@ def load_volpath(mi: Any, scene: Path, size: int, max_depth: int) -> Any:
     return mi.load_string(ElementTree.tostring(root, encoding="unicode"), integrator="volpath", size=str(size))
 
 
-def _row(method: str, spp: int, image: Image, warm: float, cold: float | None, out: Path, model: str = "") -> dict[str, Any]:
-    path = out / f"{method}_{spp}.exr"
-    write_exr(path, {c: image[..., i] for i, c in enumerate("RGB")}, {"spp": spp, "seconds": warm})
-    return {"method": method, "model": model, "spp": spp, "file": path.name, "seconds_warm": warm, "seconds_cold": cold}
+def _row(method: str, spp: int, image: Image, other: Image, warm: float, cold: float | None, out: Path, model: str = "") -> dict[str, Any]:
+    """One image and, for its noise, the same from another seed."""
+    names = [f"{method}_{spp}.exr", f"{method}_{spp}_b.exr"]
+    for name, pixels in zip(names, (image, other), strict=True):
+        write_exr(out / name, {c: pixels[..., i] for i, c in enumerate("RGB")}, {"spp": spp, "seconds": warm})
+    return {"method": method, "model": model, "spp": spp, "files": names, "seconds_warm": warm, "seconds_cold": cold}
 
 
 if __name__ == "__main__":

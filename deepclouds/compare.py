@@ -27,7 +27,7 @@ def main(argv: Sequence[str], prog: str = "deepclouds compare") -> int:
     )
     parser.add_argument("image", metavar="IMAGE", help="the image to judge (.exr); a multiple of the references' size is averaged")
     parser.add_argument("--ref", metavar="EXR", action="append", required=True, help="a reference (.exr); give it twice for A and B")
-    parser.add_argument("--noise", metavar="EXR", help="the same image from another seed: reports the noise of one pixel")
+    parser.add_argument("--noise", metavar="EXR", help="the same image from another seed: reports the noise and the error of one pixel")
     parser.add_argument("--layer", metavar="NAME", help="layer of IMAGE that holds the colours, where the file has several")
     parser.add_argument("--map", metavar="PNG", type=Path, help="write image, reference and signed relative error side by side")
     parser.add_argument("--tile", type=int, default=12, help="side of the tiles for the worst tile, pixels (default %(default)s)")
@@ -77,7 +77,10 @@ def describe(report: ErrorReport) -> str:
         f"worst tile     {100 * report.worst_tile:+7.2f} %   energy; first pixel at row {row}, column {column}",
     ]
     if report.noise is not None:
-        lines.append(f"noise          {100 * report.noise:7.2f} %   of one value, from two seeds")
+        lines.append(f"noise          {100 * report.noise:7.2f} %   of one value at the references' size, from two seeds")
+    if report.pixel_error is not None and report.pixel_error_interval is not None:
+        own = f"{interval(report.pixel_error_interval)}   rRMSE, and the noise at the image's own size"
+        lines.append(f"error, a pixel {100 * report.pixel_error:7.2f} %   {own}")
     lines.append(
         f"FLIP           {report.flip:7.4f}"
         if report.flip is not None

@@ -46,7 +46,11 @@ class ErrorReport:
     independent
         False when there was one reference only: the figures then include its noise.
     noise
-        standard deviation of one value between two seeds, over `reference_mean`; None without a second seed.
+        standard deviation of one value between two seeds, over `reference_mean`, at the references' size; None without a second seed.
+    pixel_error, pixel_error_interval
+        error of a pixel of the image as it is, of which `rrmse` sees averages only where it is larger than the references:
+        ``sqrt(rrmse^2 + n^2 - noise^2)`` with n the noise of one value at the image's own size. What a box averages away besides noise is
+        left out. None without a second seed.
     flip
         mean HDR-FLIP of the image against (A + B) / 2; None when not computed.
     confidence, block
@@ -65,6 +69,8 @@ class ErrorReport:
     values: int
     independent: bool
     noise: float | None
+    pixel_error: float | None
+    pixel_error_interval: Interval | None
     flip: float | None
     confidence: float
     block: int
@@ -186,7 +192,7 @@ def error_report(
     a, b
         two independent references of one shape. Without `b` the figures include the noise of `a`.
     second_seed
-        the same image from another seed, of the same size as `image`: gives `ErrorReport.noise` at the references' size.
+        the same image from another seed, of the same size as `image`: gives `ErrorReport.noise` and `ErrorReport.pixel_error`.
     flip
         compute HDR-FLIP (needs the package ``flip-evaluator``).
     tile
@@ -223,13 +229,16 @@ def error_report(
     intervals, used = _bootstrap(planes, block, resamples, confidence, seed)
     worst, where = worst_tile(pixels, first, second, tile)
 
-    noise = None
+    noise = pixel_error = pixel_interval = None
     if second_seed is not None:
         if np.shape(second_seed) != np.shape(image):
             raise InputError(
                 f"second seed: shape {np.shape(second_seed)} differs from the image's {np.shape(image)}; render both at one size"
             )
         noise = pixel_noise(pixels, to_reference_size(second_seed, first, "second seed"), first, second)
+        finer = max(0.0, _own_noise(image, second_seed, mask, middle) ** 2 - noise**2)
+        pixel_error, *ends = (float(np.hypot(e, np.sqrt(finer))) for e in (figures[0], *intervals[0]))
+        pixel_interval = (ends[0], ends[1])
     return ErrorReport(
         rrmse=float(figures[0]),
         rrmse_interval=intervals[0],
@@ -243,6 +252,8 @@ def error_report(
         values=int(mask.sum()),
         independent=b is not None,
         noise=noise,
+        pixel_error=pixel_error,
+        pixel_error_interval=pixel_interval,
         flip=flip_error(pixels, middle) if flip else None,
         confidence=confidence,
         block=used,
@@ -279,6 +290,14 @@ def pixel_noise(first_seed: ArrayLike, second_seed: ArrayLike, a: ArrayLike, b: 
     mask = bright_mask(reference_a, reference_b)
     scale = ((reference_a + reference_b) / 2)[mask].mean()
     return float(np.sqrt(np.mean((one - two)[mask] ** 2) / 2) / scale)
+
+
+def _own_noise(image: ArrayLike, second_seed: ArrayLike, mask: NDArray[np.bool_], middle: Floats) -> float:
+    """`pixel_noise` at the size of the images, which is a multiple of that of the references' `mask` and mean."""
+    one, two = finite_image(image), finite_image(second_seed, "second seed")
+    factor = one.shape[0] // mask.shape[0]
+    inside = mask.repeat(factor, axis=0).repeat(factor, axis=1)
+    return float(np.sqrt(np.mean((one - two)[inside] ** 2) / 2) / middle[mask].mean())
 
 
 def flip_error(image: ArrayLike, reference: ArrayLike) -> float:

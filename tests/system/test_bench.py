@@ -238,7 +238,8 @@ def test_the_runtime_is_loaded_once_and_timed_warm(tmp_path: Path, monkeypatch: 
     assert default["seconds_cold"] == pytest.approx(0.2)
     assert default["seconds_warm"] == fixed["seconds_warm"] == pytest.approx(0.04)
     assert fixed["seconds_cold"] is None
-    np.testing.assert_array_equal(read_exr(tmp_path / fixed["file"]).rgb(), 4.0)
+    np.testing.assert_array_equal(read_exr(tmp_path / fixed["files"][0]).rgb(), 4.0)
+    np.testing.assert_array_equal(read_exr(tmp_path / fixed["files"][1]).rgb(), 3.0)
     assert worker.main(["corrected", *arguments]) == 0
     assert all(r[2] for r in renders[4:])
     assert worker.main(["reference", *arguments]) == 0
@@ -270,7 +271,7 @@ def test_each_model_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
             file = f"{method}_{spp}.exr"
             write_exr(out / file, {c: 1.5 * truth[..., i] for i, c in enumerate("RGB")})
             warm = 0.5 if name == "b" else 0.25
-            rows.append({"method": method, "model": name, "spp": spp, "file": file, "seconds_warm": warm, "seconds_cold": None})
+            rows.append({"method": method, "model": name, "spp": spp, "files": [file, file], "seconds_warm": warm, "seconds_cold": None})
         (out / f"{method}.json").write_text(json.dumps(rows))
 
     monkeypatch.setattr(bench, "run_worker", run)
@@ -311,7 +312,7 @@ def test_each_model_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         ("corrected", "a", "default"),
     ]
     assert [(r["method"], r["spp"]) for r in rows[6:]] == [("octaves", "2"), ("volpath", "4")]
-    assert all(len(r) == 15 and None not in r.values() for r in rows)
+    assert all(len(r) == 18 and None not in r.values() for r in rows)
     asked.clear()
     assert bench.main([*arguments, "--models", "a,work/c.onnx", "--methods", "deepclouds"]) == 0
     assert asked == [("deepclouds", "a"), ("deepclouds", "work/c.onnx")]

@@ -206,6 +206,23 @@ def test_bad_images_are_refused_with_counts() -> None:
         error_report(truth, truth, truth, second_seed=truth[:24])
 
 
+def test_the_error_of_a_pixel_counts_the_noise_that_boxes_average_away() -> None:
+    """Expected behaviour: bias and all noise of a five times larger image; of one at the references' size the rRMSE."""
+    rng = np.random.default_rng(11)
+    truth = np.full((96, 96, 3), 2.0)
+    a, b = noisy(truth, 0.05, rng), noisy(truth, 0.05, rng)
+    large = np.full((480, 480, 3), 2.0)
+    one, two = (1.03 * large + rng.normal(0, 0.08, large.shape) for _ in range(2))
+    report = error_report(one, a, b, second_seed=two, resamples=200)
+    assert report.rrmse == pytest.approx(np.hypot(0.03, 0.04 / 5), rel=0.06)
+    assert report.pixel_error == pytest.approx(np.hypot(0.03, 0.04), rel=0.03)
+    assert report.pixel_error_interval is not None
+    assert report.pixel_error_interval[0] < report.pixel_error < report.pixel_error_interval[1]
+    same_size = error_report(one[:96, :96], a, b, second_seed=two[:96, :96], resamples=0)
+    assert same_size.pixel_error == same_size.rrmse
+    assert error_report(one, a, b, resamples=0).pixel_error is None
+
+
 @pytest.mark.parametrize("correlated", [1, 8])
 def test_bootstrap_intervals_cover(correlated: int) -> None:
     """Rationale: an interval that covers less than it says makes noise look like a result.
