@@ -216,6 +216,7 @@ def test_the_error_of_a_pixel_counts_the_noise_that_boxes_average_away() -> None
     report = error_report(one, a, b, second_seed=two, resamples=200)
     assert report.rrmse == pytest.approx(np.hypot(0.03, 0.04 / 5), rel=0.06)
     assert report.pixel_error == pytest.approx(np.hypot(0.03, 0.04), rel=0.03)
+    assert report.pixel_error is not None
     assert report.pixel_error_interval is not None
     assert report.pixel_error_interval[0] < report.pixel_error < report.pixel_error_interval[1]
     same_size = error_report(one[:96, :96], a, b, second_seed=two[:96, :96], resamples=0)
