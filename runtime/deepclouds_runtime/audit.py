@@ -7,6 +7,7 @@ the image is, on the mean, the square of the prediction's error there.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,11 +26,12 @@ _REGIONS = 24
 _DARK = 0.02
 # Points at which a correction is looked at to judge it.
 _LOOKED_AT = 1 << 16
-# Walks of the first round; every further round has as many walks as all before, the last one what is left.
-_FIRST = 1 << 18
+# Walks before the first judgement, which costs as much as tracing some hundred thousand; the next one follows when all that may be spent
+# are there. In between somebody is asked after so many whether to go on.
+_FIRST, _ROUND = 1 << 18, 1 << 18
 # Walks by default: so many a pixel, within these limits.
 WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
-# Where what is left is still so many times what was asked for, walks go on to so many times their number.
+# Where what is left may still be so many times what was asked for, walks go on to so many times their number.
 _FAR, _FURTHER = 1.25, 3
 # Standard deviations of an interval of 95 %.
 _INTERVAL = 1.96
@@ -193,7 +195,7 @@ class Outcome:
     found: dict[str, Any]
 
 
-def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: float, most: int, more: Callable[[], bool]) -> Outcome:
+def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: float, most: int, more: Callable[[float], bool]) -> Outcome:
     """Audit sources and, where it helps, correct them.
 
     Parameters
@@ -205,9 +207,9 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
     error
         the error to stop at.
     most
-        most walks; in order to correct, three times as many, up to `MOST`, where what is left is then still above 1.25 times `error`.
+        most walks; in order to correct, three times as many, up to `MOST`, where what is left may then still be above 1.25 times `error`.
     more
-        is asked between rounds whether to go on.
+        is asked between rounds whether to go on; judging and correcting will then take the seconds it is given.
 
     Returns
     -------
@@ -218,16 +220,23 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
         return Outcome(list(sources), {})
     limit = most
     while True:
+        clock = time.perf_counter()
         before = audit.before()
         reached = audit.remaining() if correct else before
-        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2 or not more():
+        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
             break
-        if correct and 1.1 * audit.count > limit and reached.squared > (_FAR * error) ** 2:
+        # To judge once more and to apply a correction take about three times as long as to judge.
+        ending = 3 * (time.perf_counter() - clock)
+        if not more(ending):
+            break
+        if correct and 1.1 * audit.count > limit and reached.squared + reached.squared_deviation > (_FAR * error) ** 2:
             limit = min(_FURTHER * most, max(MOST, most))
         # A last round that adds little tells nothing new.
         if 1.1 * audit.count > limit:
             break
-        audit.extend(min(audit.count, limit - audit.count))
+        audit.extend(min(_ROUND, limit - audit.count))
+        while audit.count < limit and more(ending):
+            audit.extend(min(_ROUND, limit - audit.count))
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}
     if correct:
         correction = audit.correction()

@@ -24,8 +24,8 @@ from deepclouds_runtime.transport import Cloud, Lights
 Rays = Callable[[Any, Stratified], tuple[Any, Any, Any]]
 # Directions of light from all around that a walk is connected to.
 _BEAMS = 4
-# Collisions of a ray that walks may start from, and the fewest rays that look for them.
-_DEPTHS, _LEAST_RAYS = 4, 1 << 13
+# Collisions of a ray that walks may start from, walks for each ray, and the fewest rays.
+_DEPTHS, _WALKS_A_RAY, _LEAST_RAYS = 4, 4, 1 << 13
 # Walks that are in memory together.
 _AT_ONCE = 1 << 18
 
@@ -88,7 +88,7 @@ class Walks:
         random = np.random.default_rng(own)
         key = int(random.integers(1 << 32))
         width, height = self._size
-        rays = max(walks // 2, _LEAST_RAYS)
+        rays = max(walks // _WALKS_A_RAY, _LEAST_RAYS)
         chosen = ((np.arange(rays) + random.random(rays)) * (width * height / rays)).astype(np.int64)
         chosen = np.minimum(chosen, width * height - 1)
         pixel = lanes_of(types.UInt32, chosen)

@@ -2,9 +2,9 @@
 
 The correction is a field d over space: J becomes J + (J + b) d, where b is a small share of the mean of J, so that places which the network
 takes for black can be lifted too. d is a sum of piecewise trilinear fields on nested lattices from coarse to fine. Each lattice takes what
-the coarser ones left, shrunken by how much of it is noise: two independent halves of the walks agree on what is real, and the mean of their
-product is its variance (Wiener's filter). A level at which they do not agree is left out: the error of a network may have no coarse part
-but a finer one. With more walks everything is taken in, down to the finest lattice.
+the coarser ones left, shrunken by how much of it is noise: two independent halves of the walks agree on what is real, and the mean of
+their product is its variance (Wiener's filter), in every neighbourhood its own as far as that is known. A level at which they do not agree
+is left out: a network's error may have no coarse part but a finer one. With more walks everything is taken in, down to the finest lattice.
 
 The noise of a node is that of its walks in number, at the variance of the walks in a wide neighbourhood. Its own walks may not tell it: the
 rare ones that find much light would be believed less for it, and the sum would be too dark. What is left of that is kept out of the image's
@@ -14,6 +14,7 @@ sum by finer levels that have none: only the single number changes it.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ _LEVELS = 7
 _FINE = 1 << (_LEVELS - 1)
 # Level whose cells share what is known of the walks' variance.
 _POOLED = 2
+# Nodes along the edge of a block, of which 3 x 3 x 3 know how much the network errs there.
+_BLOCK = 3
 # Agreement of the halves, in standard deviations of what chance would give, that does not count.
 CHANCE = 0.5
 # Independent groups of walks.
@@ -115,7 +118,7 @@ class Correction:
             for c in range(channels):
                 left = [_at_nodes(r[c] - s[c] * known[c], index, tent, count) for r, s in zip(residual, scale, strict=True)]
                 below = [_at_nodes(s[c], index, tent, count) for s in scale]
-                values[:, c] = _shrunken(left, below, _at_nodes(variance[c], index, np.square(tent), count))
+                values[:, c] = _shrunken(left, below, _at_nodes(variance[c], index, np.square(tent), count), size)
             if not values.any():
                 continue
             if level >= 0:
@@ -146,22 +149,42 @@ class Correction:
         return np.maximum(found, -1)
 
 
-def _shrunken(left: list[Array], below: list[Array], variance: Array) -> Array:
-    """What two halves leave at the nodes of a lattice, over what is below it, shrunken by the part of it that is noise."""
+def _shrunken(left: list[Array], below: list[Array], variance: Array, size: Array) -> Array:
+    """What two halves leave at the nodes of a lattice of `size` cells, over what is below it, shrunken by the part of it that is noise."""
     total = below[0] + below[1]
-    both = np.minimum(*below) > 1e-9 * float(total.max(initial=0.0))
-    if not both.any():
-        return np.zeros(len(total))
-    first, second = (np.where(both, r / np.where(both, s, 1), 0) for r, s in zip(left, below, strict=True))
-    weight = np.where(both, np.sqrt(below[0] * below[1]), 0)
-    real = float((weight * first * second).sum() / weight.sum())
-    sure = np.where(both, total, 1)
-    noise = variance / np.square(sure)
+    nodes = np.flatnonzero(np.minimum(*below) > 1e-9 * float(total.max(initial=0.0)))
+    result = np.zeros(len(total))
+    if not len(nodes):
+        return result
+    first, second = (r[nodes] / s[nodes] for r, s in zip(left, below, strict=True))
+    weight, sure = np.sqrt(below[0][nodes] * below[1][nodes]), total[nodes]
+    product, noise = weight * first * second, variance[nodes] / np.square(sure)
     # The product of two halves varies by chance by about twice the noise of their mean.
-    real -= CHANCE * float(np.sqrt(np.sum(np.square(2 * weight * noise)))) / float(weight.sum())
+    chance = np.square(2 * weight * noise)
+    real = float((product.sum() - CHANCE * np.sqrt(chance.sum())) / weight.sum())
     if not real > 0:
-        return np.zeros(len(total))
-    return np.where(both, (left[0] + left[1]) / sure * (real / (real + noise + 1e-300)), 0)
+        return result
+    # A network errs more in some places than in others: there more is believed, as far as the neighbourhood knows its own variance.
+    below_near, product_near, chance_near = _around(nodes, size, (weight, product, chance))
+    known = real**2 / (real**2 + chance_near / np.square(below_near))
+    here = np.maximum(real + known * (product_near / below_near - real), 0)
+    result[nodes] = (left[0][nodes] + left[1][nodes]) / sure * (here / (here + noise + 1e-300))
+    return result
+
+
+def _around(nodes: Array, size: Array, values: Sequence[Array]) -> list[Array]:
+    """Sums (m,) of values (m,) at some `nodes` of a lattice of `size` cells, over the nodes' neighbourhoods: 3 x 3 x 3 blocks of nodes."""
+    block = tuple(place // _BLOCK for place in np.unravel_index(nodes, tuple(size + 1)))
+    blocks = tuple(size // _BLOCK + 1)
+    index = np.ravel_multi_index(block, blocks)
+    found = []
+    for value in values:
+        grid = np.bincount(index, value, int(np.prod(blocks))).reshape(blocks)
+        for axis in range(3):
+            along = np.moveaxis(np.pad(grid, [(int(a == axis),) * 2 for a in range(3)]), axis, 0)
+            grid = np.moveaxis(along[:-2] + along[1:-1] + along[2:], 0, axis)
+        found.append(grid.ravel()[index])
+    return found
 
 
 def cells_along(edges: Array, level: int) -> NDArray[np.int64]:

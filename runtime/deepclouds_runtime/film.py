@@ -43,6 +43,11 @@ class Film:
         for c, value in enumerate(values):
             kept[pixels, c] += np.array(dr.block_sum(value, samples))
 
+    def sums(self) -> Image:
+        """The sums (pixels, 3) of all light but that of the background."""
+        total: Image = np.sum([self._sums[layer] for layer in LAYERS if layer in self._sums and layer != "background"], axis=0)
+        return total
+
     def beauty(self) -> Image:
         """The image so far (pixels, 3)."""
         return self._together(self._smoothed())

@@ -53,8 +53,15 @@ _ROOT, _ROOT_AROUND = 2.0, 4.0
 _CORRECTED, _THROWN = 1.6, 4.0
 # Walks that correct the light thrown on surfaces, by a single number.
 _WALKS_THROWN = 1 << 17
-# Collisions of a camera ray that get shadow rays.
-_DEPTHS = 4
+# Collisions of a camera ray that get shadow rays; under suns alone, where these are all that they cost, more: along a ray noise falls with
+# their number, not with its root.
+_DEPTHS, _DEPTHS_SUNS = 4, 8
+# Most walks where the time decides, and by how much longer than a trial says samples take: rounds end before the time does.
+_MOST_TIMED, _SLOWER = 1 << 26, 1.3
+# Values below this share of the brightest do not count in the noise.
+_DARK = 0.02
+# Of an error that is missed because of the network: samples cost less than the walks that would bring that down.
+_LEAST_NOISE = 0.63
 
 
 @dataclass
@@ -70,7 +77,7 @@ class Frame:
     interreflection
         whether surfaces receive the cloud's light.
     depths
-        collisions of a camera ray that get shadow rays.
+        collisions of a camera ray that get shadow rays; None chooses by the lights.
     sampled
         whether multiple scattering is sampled at one of these collisions, past the orders that are exact, in place of interpolated.
     counts, seconds
@@ -95,7 +102,7 @@ class Frame:
     types: Any
     seed: int
     interreflection: bool
-    depths: int = _DEPTHS
+    depths: int | None = None
     sampled: bool = False
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -235,25 +242,60 @@ class Frame:
         self.spent("prediction", clock)
 
     def audit(self, correct: bool, error: float, until: float, interrupted: Callable[[], bool] | None) -> None:
-        """Audit the sources, and correct them, with walks; no further round begins after the time `until`."""
+        """Audit the sources, and correct them, with walks, until about the time `until`."""
         if not self.sources:
             return
         clock = time.perf_counter()
         width, height = self.scene.size
         found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, (width, height), self.seed)
-        # Walks are as noisy as any path: half of the error takes four times as many.
-        worth = WALKS_A_PIXEL * width * height * (ERROR / error) ** 2
-        most = int(np.clip(worth, FEWEST, MOST)) if math.isinf(until) else MOST
+        most = _MOST_TIMED
+        if math.isinf(until):
+            # Walks are as noisy as any path: half of the error takes four times as many.
+            most = int(np.clip(WALKS_A_PIXEL * width * height * (ERROR / error) ** 2, FEWEST, MOST))
 
-        def more() -> bool:
-            return time.perf_counter() < until and not (interrupted is not None and interrupted())
+        def more(seconds: float) -> bool:
+            return time.perf_counter() + seconds < until and not (interrupted is not None and interrupted())
 
+        thrown = None
+        if correct and self.all_round is not None:
+            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
+            thrown = self.all_round.correct(walks, _WALKS_THROWN, self.seed)
         outcome = audited(found, self.sources, correct, error, most, more)
         self.sources, self.found = outcome.sources, outcome.found
-        if correct and self.found and self.all_round is not None and more():
-            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
-            self.found = {**self.found, "thrown": self.all_round.correct(walks, _WALKS_THROWN, self.seed)}
+        if thrown is not None and self.found:
+            self.found = {**self.found, "thrown": thrown}
         self.spent("audit", clock)
+
+    def sampling_seconds(self, error: float) -> float:
+        """How long camera samples will take to the noise that `noise_goal` asks for at least, by two samples of one pixel in four."""
+        clock = time.perf_counter()
+        # Not what the film smooths: of that a few samples know little. It takes about as long again, and a few more of them.
+        smoothed = self.film.thrown is not None
+        trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False)
+        width, height = self.scene.size
+        y, x = np.divmod(np.arange(width * height, dtype=np.uint32), np.uint32(width))
+        pixels = np.flatnonzero((x // 8 % 2 == 0) & (y // 8 % 2 == 0)).astype(np.uint32)
+        images = []
+        for sample in range(2):
+            started = time.perf_counter()
+            trial.add(pixels, sample, 1, 4)
+            spent = time.perf_counter() - started
+            images.append(trial.film.sums()[pixels])
+        self.spent("trial", clock)
+        first, mean = images[0], 0.5 * images[1]
+        lit = mean > _DARK * np.quantile(mean, 0.999)
+        if not lit.any():
+            return 0.0
+        noise = float(np.sqrt(np.mean(np.square((mean - first)[lit]))) / mean[lit].mean())
+        samples = max(2 * (noise / (_LEAST_NOISE * error)) ** 1.5, 4.0 if smoothed else 3.0)
+        # Two of every pixel, the others of those that are not dark.
+        seconds: float = spent * width * height / len(pixels) * (2 + (samples - 2) * float(lit.any(axis=1).mean()))
+        return (2 if smoothed else 1) * _SLOWER * seconds
+
+    def noise_goal(self, error: float) -> float:
+        """Noise of a pixel that makes an error together with what walks have left of the network's; at least `_LEAST_NOISE` of it."""
+        left = self.found["remaining"]["error"] if self.found.get("corrected") else 0.0
+        return error * math.sqrt(max(1 - (left / error) ** 2, _LEAST_NOISE**2))
 
     def _camera_rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any]:
         """Camera rays and where surfaces end them."""
@@ -314,9 +356,8 @@ class Frame:
             light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
         else:
             sources = self.sources or []
-            light = fast_cloud_light(
-                self.cloud, self.on_cloud, sources, origin, direction, end, numbers, self.counts, self.depths, self.sampled
-            )
+            depths = self.depths or (_DEPTHS if self.on_cloud.sources or self.sampled else _DEPTHS_SUNS)
+            light = fast_cloud_light(self.cloud, self.on_cloud, sources, origin, direction, end, numbers, self.counts, depths, self.sampled)
         dr.eval(light.direct, light.indirect)
         dr.sync_thread()
         self.spent("cloud", clock)

@@ -32,6 +32,10 @@ MODES = ("fast", "reference")
 _MOST_SAMPLES = 1 << 20
 # What the fast mode stops at by itself: a scene whose noise is still too large then says so.
 _MOST_AUTOMATIC = 1024
+# Least and most of the time that is left before an audit that it may take.
+_AUDIT = (0.3, 0.85)
+# By how much less than the usual noise keeps pixels awake where the time alone decides.
+_TIMED = 0.25
 # Error of the interpolation at a point over the noise of a pixel, both aimed at: along rays and between pixels that of points averages out.
 _INTERPOLATION = 2.5
 
@@ -185,7 +189,8 @@ class Renderer:
             is called with the share of the work done, 0 to 1.
         error
             of the fast mode: noise of a pixel to aim at, root of the mean square over the mean; the interpolation may add half as much.
-            By default 0.02; in an unbiased render with a `time_limit` the time alone decides.
+            By default 0.02; with a `time_limit` alone the time alone decides. Of an image that walks correct it is the error: noise, and
+            what the walks find to be left of the network's; where that is more than 0.77 of it already, the noise is brought to 0.63 of it.
         partial
             is called with the image so far, first of all with a quick look (fast mode: one sample a pixel with one collision, J at few
             nodes, surfaces without the cloud's light), then after each round of samples but the last. The look is thrown away: the final
@@ -203,8 +208,8 @@ class Renderer:
             audit, and correct the network's multiple scattering by what the walks say, where they say that it helps. The light that the
             cloud throws on surfaces is corrected by one number a channel.
         time_limit
-            seconds: the audit ends after half of them, sampling with the last round that should end in time. The result then depends on the
-            machine.
+            seconds: the audit ends where samples will need the rest, by a trial of a few; they end with the last round that should end in
+            time. The result then depends on the machine.
 
         Raises
         ------
@@ -212,7 +217,7 @@ class Renderer:
             when `spp` is below 1 or above 1,048,576, `error` or `time_limit` is not positive, or what is to be audited is not interpolated.
         """
         scene, types = self.scene, self._types
-        timed = self.unbiased and error is None and time_limit is not None
+        timed = error is None and time_limit is not None
         error = ERROR if error is None else error
         if not error > 0:
             raise InputError(f"error = {error}: give the noise to aim at as a share of the mean, for example {ERROR}")
@@ -254,8 +259,12 @@ class Renderer:
             look.round(0, 1, most, None)
             return self._result(look, started, None, False)
         if adaptive and not sampled and (audit or correct):
-            half_time = math.inf if time_limit is None else started + 0.5 * time_limit
-            frame.audit(correct, error, half_time, interrupted)
+            until = math.inf
+            if time_limit is not None:
+                samples, now = frame.sampling_seconds(error), time.perf_counter()
+                left = started + time_limit - now
+                until = now + min(max(left - samples, _AUDIT[0] * left), _AUDIT[1] * left)
+            frame.audit(correct, 0.0 if timed else error, until, interrupted)
 
         def so_far(noise: float) -> RenderResult:
             return self._result(frame, started, noise, False)
@@ -265,7 +274,8 @@ class Renderer:
         else:
             # Blocks that rested because their paths found little light by chance would make an unbiased image dark.
             end = math.inf if time_limit is None else started + time_limit
-            noise, stopped = rounds_for_error(frame, most, None if timed else error, error, end, not self._walks, watch, so_far)
+            goal = _TIMED * error if timed and not self._walks else frame.noise_goal(error)
+            noise, stopped = rounds_for_error(frame, most, None if timed else goal, goal, end, not self._walks, watch, so_far)
         return self._result(frame, started, noise, not stopped)
 
     def _prepared(self, frame: Frame, lights: Lights, error: float, correct: bool, interrupted: Callable[[], bool] | None) -> bool:
