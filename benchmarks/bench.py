@@ -18,7 +18,7 @@ import platform
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from benchmarks.bench_plots import write_plots
 from benchmarks.bench_rows import Row, label, markdown, medians, models, speed_ups, write_csv
 from benchmarks.page import write_results
-from benchmarks.worker import DEFAULT_SPP, METHODS, OURS
+from benchmarks.worker import DEFAULT_SPP, METHODS, OURS, TIMED
 from deepclouds.errors import InputError
 from deepclouds.exr import read_exr
 from deepclouds.metrics import error_report
@@ -43,7 +43,7 @@ ROOT = Path(__file__).resolve().parent.parent
 @dataclass(frozen=True)
 class Plan:
     """What is run on every scene: methods, models for those that ask one, and samples a pixel of deepclouds and, at the references' size,
-    of its peers; the first seed; the folder of images.
+    of its peers; the first seed; the folder of images; seconds of an image that is limited in time, by what lights a scene.
     """
 
     methods: Sequence[str]
@@ -52,6 +52,7 @@ class Plan:
     peers: Sequence[int]
     seed: int
     out: Path
+    times: Mapping[str, float]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,6 +68,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--spp", help="spp of the peers at the references' size, fewer for more pixels (default 16,64,256; with --quick 4,16)"
     )
     parser.add_argument("--ours", help="spp of deepclouds, 0 for its own choice (default 0,1,4,16; with --quick 0)")
+    parser.add_argument(
+        "--time",
+        type=float,
+        nargs=2,
+        metavar=("SUN", "SKY"),
+        help="also render ours in so many seconds, scenes under suns and under an environment",
+    )
     parser.add_argument(
         "--models",
         help=f"comma-separated names or files of models (default {','.join(RELEASED)}; with --quick the first)",
@@ -94,6 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _spp_list("--spp", options.spp or ("4,16" if options.quick else "16,64,256"), least=1),
         options.seed,
         options.out,
+        dict(zip(("sun", "environment"), options.time, strict=True)) if options.time else {},
     )
 
     print(machine())
@@ -127,12 +136,18 @@ def measure(
     # As many samples in all, whatever the number of pixels that they are spread over.
     spread = sorted({max(1, spp * len(references[0]) ** 2 // size**2) for spp in plan.peers})
     # Octaves have no choice of their own.
-    spps = {"deepclouds": plan.ours, "corrected": [DEFAULT_SPP], "octaves": [n for n in plan.ours if n != DEFAULT_SPP] or [4]}
-    for method in plan.methods:
+    spps = {
+        "deepclouds": plan.ours,
+        "corrected": [DEFAULT_SPP],
+        TIMED: [DEFAULT_SPP],
+        "octaves": [n for n in plan.ours if n != DEFAULT_SPP] or [4],
+    }
+    seconds = plan.times.get(light_of(scene / "scene.xml"))
+    for method in (*plan.methods, *([] if seconds is None else [TIMED])):
         for model in plan.models if method in OURS else [None]:
             name = "" if model is None else model_name(model)
             folder = plan.out / scene.name / name
-            problem = run_worker(method, scene / "scene.xml", size, spps.get(method, spread), plan.seed, folder, model)
+            problem = run_worker(method, scene / "scene.xml", size, spps.get(method, spread), plan.seed, folder, model, seconds)
             if problem is not None:
                 failures.append(f"{scene.name}: {label(method, name)} did not run: {problem}")
                 print(failures[-1], file=sys.stderr)
@@ -143,8 +158,8 @@ def measure(
             for entry in entries:
                 image, other = (read_exr(folder / name).rgb() for name in entry["files"])
                 report = error_report(image, *references, second_seed=other, flip=find_spec("flip_evaluator") is not None)
-                seconds = entry["seconds_warm"], entry["seconds_cold"]
-                rows.append(Row(entry["method"], scene.name, entry["spp"], *seconds, report, entry["model"]))
+                spent = entry["seconds_warm"], entry["seconds_cold"]
+                rows.append(Row(entry["method"], scene.name, entry["spp"], *spent, report, entry["model"]))
                 print(_line(rows[-1]), flush=True)
 
 
@@ -172,10 +187,13 @@ def find_scenes(folder: Path, only: str | None) -> list[Path]:
     return [found[n] for n in names]
 
 
-def run_worker(method: str, scene: Path, size: int, spps: Sequence[int], seed: int, out: Path, model: str | None) -> str | None:
+def run_worker(
+    method: str, scene: Path, size: int, spps: Sequence[int], seed: int, out: Path, model: str | None, seconds: float | None = None
+) -> str | None:
     """Run one method in a fresh process; returns the last line of its complaint, or None when all went well."""
     command = [sys.executable, "-m", "benchmarks.worker", method, str(scene), "--size", str(size), "--seed", str(seed)]
     command += ["--spp", ",".join(map(str, spps)), "--out", str(out), *(["--model", model] if model else [])]
+    command += ["--time", str(seconds)] if method == TIMED else []
     # The child finds the same packages as this process, however they were put on the path.
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in (str(ROOT), *sys.path) if p)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

@@ -12,7 +12,7 @@ from deepclouds.replacing import replacing
 
 # A colour a model, a marker and a line a mode; the peers have both of their own.
 _MODELS = ("#b3122a", "#d9822b", "#7a3b8f", "#8c6d5a")
-_MODES = {"deepclouds": ("o", "-"), "corrected": ("*", "-"), "reference": ("D", ":")}
+_MODES = {"deepclouds": ("o", "-"), "corrected": ("*", "-"), "reference": ("D", ":"), "timed": ("P", ":")}
 _PEERS = {
     "unbiased": ("#777777", "P"),
     "octaves": ("#3d8a5f", "v"),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.equal_error import Bounded, Timing, interpolated_seconds, unbiased_seconds
-from benchmarks.worker import DEFAULT_SPP, OURS
+from benchmarks.worker import DEFAULT_SPP, OURS, TIMED
 from deepclouds.metrics import ErrorReport
 from deepclouds.replacing import replacing
 
@@ -22,7 +22,7 @@ _LABELS = {
 # What the modes of deepclouds add to the model's name.
 # The fast mode, what `deepclouds render` does by itself first.
 FAST = ("corrected", "deepclouds")
-_MODES = {"deepclouds": "", "corrected": ", corrected", "reference": ", every sample asks"}
+_MODES = {"deepclouds": "", "corrected": ", corrected", "reference": ", every sample asks", TIMED: ", limited in time"}
 
 
 @dataclass(frozen=True)

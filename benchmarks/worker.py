@@ -2,11 +2,12 @@
 
     python -m benchmarks.worker METHOD scene.xml --size 96 --spp 16,64 --seed 7 --out folder
 
-METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), reference (its method as published: every sample
-asks the network), unbiased (its own path tracer), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its denoised image) or single
-(single scattering). Writes two EXRs an image, which differ in their seed, and `METHOD.json`: for each image its method, model, spp, files,
-seconds warm and seconds cold; nothing for a model that was not trained on the scene's medium. Warm: scene, kernels and model are loaded,
-all work that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and loading included.
+METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), timed (that with --time), reference (its method as
+published: every sample asks the network), unbiased (its own path tracer), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its
+denoised image) or single (single scattering). Writes two EXRs an image, which differ in their seed, and `METHOD.json`: for each image its
+method, model, spp, files, seconds warm and seconds cold; nothing for a model that was not trained on the scene's medium. Warm: scene, kernels
+and model are loaded, all work that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and
+loading included.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from deepclouds.errors import InputError
 from deepclouds.exr import write_exr
 
 Image = NDArray[np.float32]
-# Modes of deepclouds, which ask a model, and all methods.
-OURS = ("deepclouds", "corrected", "reference")
-METHODS = (*OURS, "unbiased", "octaves", "volpath", "oidn", "single")
+# Modes of deepclouds, which ask a model, and all methods; what is limited in time is run where a time is given.
+TIMED = "timed"
+OURS = ("deepclouds", "corrected", "reference", TIMED)
+METHODS = (*(m for m in OURS if m != TIMED), "unbiased", "octaves", "volpath", "oidn", "single")
 # The spp that stands for "what the renderer chooses itself".
 DEFAULT_SPP = 0
 
@@ -38,18 +40,19 @@ DEFAULT_SPP = 0
 def main(argv: Sequence[str] | None = None) -> int:
     """Render, time and write; returns 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.worker", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("method", choices=METHODS)
+    parser.add_argument("method", choices=(*METHODS, TIMED))
     parser.add_argument("scene", type=Path)
     parser.add_argument("--size", type=int, required=True)
     parser.add_argument("--spp", required=True, help="comma-separated; 0: the renderer's own default (deepclouds only)")
     parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--time", type=float, help="timed: seconds an image")
     parser.add_argument("--model", help="deepclouds: name or file of a model (default: the one that it takes by itself)")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(argv)
     spps = [int(s) for s in options.spp.split(",")]
     options.out.mkdir(parents=True, exist_ok=True)
     if options.method in (*OURS, "unbiased"):
-        rows = render_deepclouds(options.method, options.scene, options.size, spps, options.seed, options.out, options.model)
+        rows = render_deepclouds(options.method, options.scene, options.size, spps, options.seed, options.out, options.model, options.time)
     elif options.method == "octaves":
         rows = render_octaves(options.scene, options.size, spps, options.seed, options.out)
     else:
@@ -59,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def render_deepclouds(
-    method: str, scene: Path, size: int, spps: list[int], seed: int, out: Path, model: str | None
+    method: str, scene: Path, size: int, spps: list[int], seed: int, out: Path, model: str | None, seconds: float | None = None
 ) -> list[dict[str, Any]]:
     """Time the runtime: the second render with another seed is the warm one."""
     start = time.perf_counter()
@@ -75,7 +78,8 @@ def render_deepclouds(
         name = renderer.predictor.path.stem
 
     def render(spp: int, seed: int) -> Image:
-        result = renderer.render(None if spp == DEFAULT_SPP else spp, seed, correct=method == "corrected")
+        limit = {"time_limit": seconds} if method == TIMED else {}
+        result = renderer.render(None if spp == DEFAULT_SPP else spp, seed, correct=method in ("corrected", TIMED), **limit)
         return np.asarray(result.rgb, dtype=np.float32)[..., :3]
 
     return _twice(render, method, name, spps, seed, loaded, out)

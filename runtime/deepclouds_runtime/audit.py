@@ -225,8 +225,8 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
         reached = audit.remaining() if correct else before
         if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
             break
-        # To judge once more and to apply a correction take about three times as long as to judge.
-        ending = 3 * (time.perf_counter() - clock)
+        # To judge once more and to apply a correction take about four times as long as to judge.
+        ending = 4 * (time.perf_counter() - clock)
         if not more(ending):
             break
         if correct and 1.1 * audit.count > limit and reached.squared + reached.squared_deviation > (_FAR * error) ** 2:

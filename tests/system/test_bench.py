@@ -261,7 +261,10 @@ def test_each_model_is_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     """
     asked: list[tuple[str, str | None]] = []
 
-    def run(method: str, scene: Path, size: int, spps: Sequence[int], seed: int, out: Path, model: str | None) -> None:
+    def run(
+        method: str, scene: Path, size: int, spps: Sequence[int], seed: int, out: Path, model: str | None, seconds: float | None
+    ) -> None:
+        assert seconds is None
         asked.append((method, model))
         out.mkdir(parents=True, exist_ok=True)
         rows = []
