@@ -5,9 +5,9 @@
 METHOD is deepclouds (its fast mode), corrected (the same with the correction by walks), timed (that with --time), reference (its method as
 published: every sample asks the network), unbiased (its own path tracer), octaves (`benchmarks.octaves`), volpath, oidn (volpath and its
 denoised image) or single (single scattering). Writes two EXRs an image, which differ in their seed, and `METHOD.json`: for each image its
-method, model, spp, files, seconds warm and seconds cold; nothing for a model that was not trained on the scene's medium. Warm: scene, kernels
-and model are loaded, all work that depends on the sun or the camera included. Cold: what a first image costs a fresh process, imports and
-loading included.
+method, model, spp, files, seconds warm and seconds cold; nothing for a model that was not trained on the scene's medium. Warm: scene,
+kernels and model are loaded, all work that depends on the sun or the camera included. Cold: what a first image costs a fresh process,
+imports and loading included.
 """
 
 from __future__ import annotations
