@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from deepclouds.errors import InputError
-from deepclouds_runtime._job import ERROR_OF_FRAMES, corrects, plan
+from deepclouds_runtime._job import ERROR_OF_FRAMES, Plan, corrects, plan
 from deepclouds_runtime.sequence import parse_frames
 
 _PAIR = "AZ,EL"
@@ -91,7 +91,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--error",
         type=float,
-        help=f"noise of a pixel to aim at, as a share of the mean (default 0.02; of several frames {ERROR_OF_FRAMES})",
+        help="error of a pixel to aim at, as a share of the mean: noise, and what a correction leaves "
+        f"(default 0.02; of several frames {ERROR_OF_FRAMES})",
     )
     parser.add_argument(
         "--audit", action="store_true", help="measure the network's error in this image with path-traced walks, and report it (fast mode)"
@@ -105,7 +106,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--time",
         type=float,
         metavar="SECONDS",
-        help="the audit ends after half of them, sampling with the round in which they are over; the image then depends on the machine",
+        help="end in time; without --error all of it is used, in a corrected image with the model 'fast'. "
+        "The image then depends on the machine",
     )
     parser.add_argument(
         "--mode", choices=("fast", "reference"), default="fast", help="reference: every sample asks the network (default %(default)s)"
@@ -117,7 +119,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--unbiased", action="store_true", help="trace paths until --error, --time or --spp is reached; no network is loaded"
     )
     parser.add_argument("--seed", type=_seed, default=0, help="of all random numbers (default %(default)s)")
-    parser.add_argument("--model", metavar="FILE", help="network to use (default: the one that comes with deepclouds)")
+    parser.add_argument("--model", metavar="FILE", help="network to use, a file or a name (default: accurate; see --time)")
     parser.add_argument(
         "--extrapolate", action="store_true", help="ask the network about media it was not trained on, in place of tracing paths there"
     )
@@ -229,8 +231,16 @@ def run(argv: Sequence[str], prog: str) -> int:
         **how,
     }
     say: Callable[[str], None] = (lambda text: None) if arguments.quiet else partial(print, flush=True)
-    load = {"defines": defines, "model": arguments.model, "threads": arguments.threads, **options, **how}
+    load = {"defines": defines, "model": _model(arguments, made), "threads": arguments.threads, **options, **how}
     return run_job(made, arguments, load, record, say)
+
+
+def _model(arguments: argparse.Namespace, made: Plan) -> str | None:
+    """The model to load: where walks correct what the time allows, the quick one leaves them more of it, and ends no worse."""
+    if arguments.model is None and arguments.time is not None and arguments.error is None and corrects(arguments, made):
+        return "fast"
+    model: str | None = arguments.model
+    return model
 
 
 def _negative_pairs(argv: Sequence[str]) -> list[str]:

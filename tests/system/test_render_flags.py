@@ -13,6 +13,7 @@ from types import ModuleType
 import deepclouds_runtime
 import numpy as np
 import pytest
+from deepclouds_runtime import _job
 from deepclouds_runtime._command import _parser
 from numpy.typing import NDArray
 
@@ -182,3 +183,27 @@ def test_bad_values_end_in_code_2(folder: Path, capsys: pytest.CaptureFixture[st
 def test_an_empty_volume_has_no_optical_depth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", str(folder / "empty.vol"), "-o", str(folder / "image.exr"), "--optical-depth", "5"]) == 2
     assert "empty.vol: the volume is empty, so no extinction gives it an optical depth of 5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "model"),
+    [
+        ([], None),
+        (["--time", "3"], "fast"),
+        (["--time", "3", "--model", "accurate"], "accurate"),
+        (["--time", "3", "--error", "0.01"], None),
+        (["--time", "3", "--no-correct"], None),
+        (["--time", "3", "--unbiased"], None),
+    ],
+)
+def test_the_time_alone_picks_the_quick_model(flags: list[str], model: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected behaviour: only where walks correct what a given time allows, and nobody named a model."""
+    loaded: list[object] = []
+
+    def run(made: object, arguments: object, load: dict[str, object], record: object, say: object) -> int:
+        loaded.append(load["model"])
+        return 0
+
+    monkeypatch.setattr(_job, "run", run)
+    assert main(["render", str(CLOUD), "-o", str(tmp_path / "x.exr"), *flags]) == 0
+    assert loaded == [model]
