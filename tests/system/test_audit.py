@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deepclouds_runtime import correction
 from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
@@ -235,6 +236,29 @@ def test_more_walks_leave_less() -> None:
     assert max(harm[1:]) < 0.02
 
 
+def test_a_place_where_the_network_fails_is_believed_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected behaviour: where a hundredth of the cloud has a third of its light, less is left than by one variance for all."""
+    rng = np.random.default_rng(5)
+    middle = np.array([0.3, 0.3, 0.4])
+
+    def truth(points: Array) -> Array:
+        near = np.linalg.norm(points - middle, axis=1) < 0.12
+        result: Array = 1 + 0.05 * np.sin(6 * points[:, 0]) + 2.0 * near
+        return result
+
+    sums = Sums(np.zeros(3), np.array([1.0, 0.6, 0.8]), np.array([0.02]))
+    for group in range(GROUPS):
+        points = rng.random((200_000, 3)) * (1, 0.6, 0.8)
+        walked = truth(points) * np.where(rng.random(len(points)) < 0.2, rng.exponential(5.0, len(points)), 0)
+        sums.add(points, np.ones(len(points)), np.ones((len(points), 1)), walked[:, None], group)
+    inside = middle + 0.04 * rng.normal(size=(500, 3))
+    left = []
+    for block in (correction._BLOCK, 10_000):
+        monkeypatch.setattr(correction, "_BLOCK", block)
+        left.append(float(np.abs(truth(inside) - 1 - Correction(sums)(inside)[:, 0] * 1.02).mean()))
+    assert left[0] < 0.8 * left[1], left
+
+
 def test_rare_large_walks_do_not_darken() -> None:
     """A node that believed its walks by their own spread would take back what the largest of them bring."""
     means = []
@@ -254,6 +278,6 @@ def test_halves_that_are_left_out_say_nothing() -> None:
 
 
 def test_no_walks_correct_nothing() -> None:
-    correction = Correction(Sums(np.zeros(3), np.zeros(3), np.ones(1)))
-    assert correction.levels == 0
-    assert not correction(np.random.default_rng(1).random((10, 3))).any()
+    nothing = Correction(Sums(np.zeros(3), np.zeros(3), np.ones(1)))
+    assert nothing.levels == 0
+    assert not nothing(np.random.default_rng(1).random((10, 3))).any()
