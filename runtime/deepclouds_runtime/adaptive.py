@@ -9,7 +9,7 @@ import numpy as np
 from deepclouds_runtime.result import Image
 
 # Values below this share of the brightest do not count in the noise.
-_DARK = 0.02
+DARK = 0.02
 # Side of the blocks of pixels that rest together, and the share of the noise asked for that resting blocks may have.
 _BLOCK, _REST = 8, 0.5
 # The variance of well spread samples falls a little faster than with their number: the power of the number that it asks for.
@@ -71,7 +71,7 @@ class Adaptive:
             self._rounds += 1
             self._scatter += change * (done / (samples - done) * samples)
             self._variance = self._scatter / (self._rounds * samples)
-        lit = after > _DARK * np.quantile(after, 0.999)
+        lit = after > DARK * np.quantile(after, 0.999)
         if not lit.any():
             return 0.0, 1.0
         allowed = (error * float(after[lit].mean(dtype=np.float64))) ** 2 * np.count_nonzero(lit)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from deepclouds.backend import lanes_of
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain
-from deepclouds_runtime.adaptive import Adaptive
+from deepclouds_runtime.adaptive import DARK, Adaptive
 from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
 from deepclouds_runtime.audit_walks import Walks
@@ -58,8 +58,6 @@ _WALKS_THROWN = 1 << 17
 _DEPTHS, _DEPTHS_SUNS = 4, 8
 # Most walks where the time decides, and by how much longer than a trial says samples take: rounds end before the time does.
 _MOST_TIMED, _SLOWER = 1 << 26, 1.3
-# Values below this share of the brightest do not count in the noise.
-_DARK = 0.02
 # Of an error that is missed because of the network: samples cost less than the walks that would bring that down.
 _LEAST_NOISE = 0.63
 
@@ -283,7 +281,7 @@ class Frame:
             images.append(trial.film.sums()[pixels])
         self.spent("trial", clock)
         first, mean = images[0], 0.5 * images[1]
-        lit = mean > _DARK * np.quantile(mean, 0.999)
+        lit = mean > DARK * np.quantile(mean, 0.999)
         if not lit.any():
             return 0.0
         noise = float(np.sqrt(np.mean(np.square((mean - first)[lit]))) / mean[lit].mean())
