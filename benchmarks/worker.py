@@ -30,9 +30,9 @@ from deepclouds.exr import write_exr
 
 Image = NDArray[np.float32]
 # Modes of deepclouds, which ask a model, and all methods; what is limited in time is run where a time is given.
-TIMED = "timed"
-OURS = ("deepclouds", "corrected", "reference", TIMED)
-METHODS = (*(m for m in OURS if m != TIMED), "unbiased", "octaves", "volpath", "oidn", "single")
+_ASKING, TIMED = ("deepclouds", "corrected", "reference"), "timed"
+OURS = (*_ASKING, TIMED)
+METHODS = (*_ASKING, "unbiased", "octaves", "volpath", "oidn", "single")
 # The spp that stands for "what the renderer chooses itself".
 DEFAULT_SPP = 0
 

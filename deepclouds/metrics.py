@@ -236,7 +236,9 @@ def error_report(
                 f"second seed: shape {np.shape(second_seed)} differs from the image's {np.shape(image)}; render both at one size"
             )
         noise = pixel_noise(pixels, to_reference_size(second_seed, first, "second seed"), first, second)
-        finer = max(0.0, _own_noise(image, second_seed, mask, middle) ** 2 - noise**2)
+        factor = np.shape(image)[0] // mask.shape[0]
+        own = finite_image(image), finite_image(second_seed, "second seed")
+        finer = max(0.0, _noise(*own, mask.repeat(factor, axis=0).repeat(factor, axis=1)) ** 2 / middle[mask].mean() ** 2 - noise**2)
         pixel_error, *ends = (float(np.hypot(e, np.sqrt(finer))) for e in (figures[0], *intervals[0]))
         pixel_interval = (ends[0], ends[1])
     return ErrorReport(
@@ -289,15 +291,12 @@ def pixel_noise(first_seed: ArrayLike, second_seed: ArrayLike, a: ArrayLike, b: 
     two = to_reference_size(second_seed, reference_a, "second seed")
     mask = bright_mask(reference_a, reference_b)
     scale = ((reference_a + reference_b) / 2)[mask].mean()
-    return float(np.sqrt(np.mean((one - two)[mask] ** 2) / 2) / scale)
+    return _noise(one, two, mask) / float(scale)
 
 
-def _own_noise(image: ArrayLike, second_seed: ArrayLike, mask: NDArray[np.bool_], middle: Floats) -> float:
-    """`pixel_noise` at the size of the images, which is a multiple of that of the references' `mask` and mean."""
-    one, two = finite_image(image), finite_image(second_seed, "second seed")
-    factor = one.shape[0] // mask.shape[0]
-    inside = mask.repeat(factor, axis=0).repeat(factor, axis=1)
-    return float(np.sqrt(np.mean((one - two)[inside] ** 2) / 2) / middle[mask].mean())
+def _noise(one: Floats, two: Floats, mask: NDArray[np.bool_]) -> float:
+    """Standard deviation of one value inside the mask, from two seeds."""
+    return float(np.sqrt(np.mean((one - two)[mask] ** 2) / 2))
 
 
 def flip_error(image: ArrayLike, reference: ArrayLike) -> float:

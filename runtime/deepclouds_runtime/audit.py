@@ -26,9 +26,9 @@ _REGIONS = 24
 _DARK = 0.02
 # Points at which a correction is looked at to judge it.
 _LOOKED_AT = 1 << 16
-# Walks before the first judgement, which costs as much as tracing some hundred thousand; the next one follows when all that may be spent
-# are there. In between somebody is asked after so many whether to go on.
-_FIRST, _ROUND = 1 << 18, 1 << 18
+# Walks of a round, after which somebody is asked whether to go on. The first is judged, which costs as much as tracing some hundred
+# thousand; the next judgement follows when all that may be spent are there.
+_ROUND = 1 << 18
 # Walks by default: so many a pixel, within these limits.
 WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
 # Where what is left may still be so many times what was asked for, walks go on to so many times their number.
@@ -215,7 +215,7 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
     -------
     The sources, and what was found; nothing where the camera sees no cloud.
     """
-    audit.extend(min(_FIRST, most))
+    audit.extend(min(_ROUND, most))
     if not audit.count:
         return Outcome(list(sources), {})
     limit = most
@@ -234,7 +234,6 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
         # A last round that adds little tells nothing new.
         if 1.1 * audit.count > limit:
             break
-        audit.extend(min(_ROUND, limit - audit.count))
         while audit.count < limit and more(ending):
             audit.extend(min(_ROUND, limit - audit.count))
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}

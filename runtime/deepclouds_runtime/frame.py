@@ -255,7 +255,7 @@ class Frame:
             return time.perf_counter() + seconds < until and not (interrupted is not None and interrupted())
 
         thrown = None
-        if correct and self.all_round is not None:
+        if correct and self.all_round is not None and more(0.0):
             walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
             thrown = self.all_round.correct(walks, _WALKS_THROWN, self.seed)
         outcome = audited(found, self.sources, correct, error, most, more)

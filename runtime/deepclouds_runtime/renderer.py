@@ -21,7 +21,7 @@ from deepclouds_runtime.error_parts import error_parts
 from deepclouds_runtime.frame import ERROR, Frame
 from deepclouds_runtime.lights import Shade, environment
 from deepclouds_runtime.result import COLOURS, RenderResult, Statistics
-from deepclouds_runtime.rounds import Watch, fixed_rounds, rounds_for_error
+from deepclouds_runtime.rounds import Watch, fixed_rounds, rounds_for_error, say_ignored
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped, WalkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.surfaces import Reflectors
@@ -272,6 +272,9 @@ class Renderer:
         if spp is not None or not adaptive:
             noise, stopped = fixed_rounds(frame, most, error, watch, so_far)
         else:
+            # Paths that nobody asked for stop at the scene's own number.
+            if (own := int(scene.sensor.sampler().sample_count())) != most:
+                say_ignored(None if timed else error, own)
             # Blocks that rested because their paths found little light by chance would make an unbiased image dark.
             end = math.inf if time_limit is None else started + time_limit
             goal = _TIMED * error if timed and not self._walks else frame.noise_goal(error)

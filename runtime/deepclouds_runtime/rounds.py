@@ -77,9 +77,6 @@ def rounds_for_error(
     watch, so_far
         who is told, and the image so far from its noise.
     """
-    # Paths that nobody asked for stop at the scene's own number.
-    if (own := int(frame.scene.sensor.sampler().sample_count())) != most:
-        _say_ignored(error, own)
     started, noise, growth, pace = time.perf_counter(), math.inf, 2.0, 0.0
     frame.round(0, 1, most, None)
     while frame.samples < most and (target is None or not noise <= target):
@@ -111,9 +108,10 @@ def rounds_for_error(
 
 
 @cache
-def _say_ignored(error: float, asked: int) -> None:
-    """Once for all frames of a sequence."""
-    _LOG.info("samples a pixel are chosen for an error of %g; the scene's own %d are ignored (spp forces a number)", error, asked)
+def say_ignored(error: float | None, asked: int) -> None:
+    """Say that a scene's own number of samples is ignored, once for all frames of a sequence; without an error the time decides."""
+    what = "until the time is over" if error is None else f"for an error of {error:g}"
+    _LOG.info("samples a pixel are chosen %s; the scene's own %d are ignored (spp forces a number)", what, asked)
 
 
 def _say_ahead(samples: int, noise: float, error: float, end: float, most: int, pace: float) -> None:
