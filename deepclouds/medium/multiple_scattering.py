@@ -106,12 +106,23 @@ class _Queries:
 
 def _uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any]:
     """The next state and a number in [0, 1) of xoroshiro64* (Blackman and Vigna 2021), which needs 32-bit arithmetic alone."""
+    rng, bits = _bits(rng)
+    return rng, types.Float(bits >> 8) * (1.0 / 16777216.0)
+
+
+def _bits(rng: list[Any]) -> tuple[list[Any], Any]:
     s0, s1 = rng
     bits = s0 * 0x9E3779BB
     s1 = s1 ^ s0
     s0 = ((s0 << 26) | (s0 >> 6)) ^ s1 ^ (s1 << 9)
     s1 = (s1 << 13) | (s1 >> 19)
-    return [s0, s1], types.Float(bits >> 8) * (1.0 / 16777216.0)
+    return [s0, s1], bits
+
+
+def _three_uniform(types: Any, rng: list[Any]) -> tuple[list[Any], list[Any]]:
+    """The next state and three numbers of ten bits each, in the middle of their intervals: for choices that need no more."""
+    rng, bits = _bits(rng)
+    return rng, [(types.Float((bits >> shift) & 1023) + 0.5) * (1.0 / 1024.0) for shift in (22, 12, 2)]
 
 
 def _stream(types: Any, key: Any, number: Any) -> list[Any]:
@@ -198,7 +209,8 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         distance, tentative, majorant = field.majorants.step(position, along, distance, u_step, traced)
         unit = dr.fma(along, distance, position)
         inside = traced & field.holds_unit(unit)
-        sigma = field.sigma_t_unit(unit, inside & tentative)
+        rng, thirds = _three_uniform(types, rng)
+        sigma = field.drawn_unit(unit, thirds, inside & tentative)
         hit = inside & tentative & (u_event * majorant < sigma)
 
         collision = hit & ~shadow

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _phase, _Queries, _sample_cosine, _stream, _uniform
+from deepclouds.medium.multiple_scattering import _TURN, _phase, _Queries, _sample_cosine, _stream, _three_uniform, _uniform
 from deepclouds.medium.phase import as_lobes, rotate_to
 
 # What a lane is tracing: the walk, the shadow of a vertex, a side branch, the shadow of the branch's end.
@@ -118,6 +118,7 @@ def _loop(
     sun = dr.zeros(Array3f, lanes)
     albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
+    found = [dr.zeros(Float, lanes) for _ in range(m_albedos)]  # of the walk so far
     # Albedo where a branch has landed, if it varies; else the weight has it already.
     of_branch_end = [dr.full(Float, 1, lanes) for _ in range(m_albedos if varying is not None else 0)]
 
@@ -126,6 +127,9 @@ def _loop(
     while alive:
         # As in `trace_walks`: lanes that have ended wait for a common turn.
         if ended & (clock % _TURN == 0):
+            for m in range(m_albedos):
+                dr.scatter(result, found[m], number * m_albedos + m, number < limit)
+                found[m] = Float(0)
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
             point = number // walks_each
@@ -165,18 +169,18 @@ def _loop(
         distance, tentative, majorant = field.majorants.step(start, along, distance, u_step, traced)
         unit = dr.fma(along, distance, start)
         inside = traced & field.holds_unit(unit)
-        sigma = field.sigma_t_unit(unit, inside & tentative)
+        rng, thirds = _three_uniform(types, rng)
+        sigma = field.drawn_unit(unit, thirds, inside & tentative)
         hit = inside & tentative & (u_event * majorant < sigma)
         gone = traced & ~inside
         over = hit | gone
 
-        # A walk's results are its lane's alone.
         lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
         for m in range(m_albedos):
             arriving = value * weight[m]
             if varying is not None:
                 arriving *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
-            dr.scatter_add(result, arriving, number * m_albedos + m, lit, mode=dr.ReduceMode.NoConflicts)
+            found[m] += dr.select(lit, arriving, 0)
 
         collision = hit & walking
         if varying is not None:

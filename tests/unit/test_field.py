@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from deepclouds.backend import backend
 from deepclouds.medium.field import Field
-from deepclouds.volume import Volume
+from deepclouds.volume import SparseVolume, Volume
+from deepclouds.volume.bricks import Bricks
 
 Floats = NDArray[np.float64]
 
@@ -56,6 +57,25 @@ def test_a_sample_sits_at_its_cell_centre() -> None:
     k, j, i = np.meshgrid(*(np.arange(n) for n in volume.density.shape), indexing="ij")
     unit = np.stack([(a.ravel() + 0.5) / n for a, n in zip((i, j, k), volume.resolution, strict=True)], axis=1)
     np.testing.assert_allclose(lookup(Field(backend(), volume), to_world(volume, unit)), volume.density.ravel(), atol=2e-5)
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 9), (1, 5, 9), (40, 3, 20)])
+@pytest.mark.parametrize("sparse", [False, True])
+def test_drawn_samples_are_interpolated_on_the_mean(shape: tuple[int, int, int], sparse: bool) -> None:
+    full = box(shape, seed=8)
+    volume = Volume(np.where(full.density < 0.5, np.float32(0), full.density), full.to_world)
+    field = Field(backend(), SparseVolume(Bricks.from_dense(volume.density), volume.to_world) if sparse else volume, 2.5)
+    t, rng, many = field.types, np.random.default_rng(2), 4096
+    unit = np.repeat(rng.uniform(0, 1, (60, 3)), many, axis=0).astype(np.float32)
+    at = t.Array3f(*(t.Float(np.ascontiguousarray(unit[:, c])) for c in range(3)))
+    numbers = [t.Float(rng.random(len(unit), np.float32)) for _ in range(3)]
+    drawn = np.array(field.drawn_unit(at, numbers), np.float64).reshape(60, many)
+    expected = np.array(field.sigma_t_unit(at), np.float64).reshape(60, many)[:, 0]
+    assert np.isin(drawn, (2.5 * volume.density.astype(np.float64)).astype(np.float32)).all()
+    error = drawn.std(axis=1) / np.sqrt(many)
+    assert np.all(np.abs(drawn.mean(axis=1) - expected) < 4.5 * error + 1e-5)
+    assert np.count_nonzero(error > 0) > 30
+    assert not np.array(field.drawn_unit(at, numbers, t.Bool(False))).any()
 
 
 def test_faces_belong_to_the_box_and_the_cut_is_hard() -> None:

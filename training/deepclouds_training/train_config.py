@@ -38,7 +38,8 @@ class TrainConfig(BaseModel):
     power
         exponent of the loss's weight.
     precision
-        arithmetic of the hidden layers' products in training; weights, loss, averages and validation are float32 either way.
+        arithmetic of the hidden layers' products in training; weights, loss, averages and validation are float32 either way. Where the
+        device would emulate ``bfloat16``, they are computed in float32 too.
     network, samples
         the network's shape and the samples' selection.
     companion

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deepclouds.errors import InputError
-from deepclouds_training.device import chosen_device
+from deepclouds_training.device import chosen_device, multiplies_bfloat16
 from deepclouds_training.events import Events
 from deepclouds_training.learner import Learner
 from deepclouds_training.loss import relative_squared_error
@@ -75,7 +75,9 @@ class Trainer:
         self.valid_source = SampleSource(dataset, valid[: config.valid_shards], config.samples, config.seed + 1)
         self.valid: Samples | None = None
         self.device = chosen_device(config.device, self.processes.local_rank)
-        half = config.precision == "bfloat16"
+        half = config.precision == "bfloat16" and multiplies_bfloat16(self.device)
+        if half != (config.precision == "bfloat16"):
+            log.info("precision = 'bfloat16': this %s would emulate it, many times slower; float32 in its place", self.device.type.upper())
         torch.manual_seed(config.seed)
         self.learner = Learner(config.network, config.ema, half, self.device)
         self.companion = Learner(config.companion, config.ema, half, self.device) if config.companion is not None else None
