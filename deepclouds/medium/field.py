@@ -121,7 +121,8 @@ class Field:
             lanes to look up; the others return 0.
         """
         low, frac = self._cells(unit)
-        chosen = [self.types.UInt32(index) + dr.select(u < f, self.types.UInt32(1), 0) for index, f, u in zip(low, frac, numbers, strict=True)]
+        one = self.types.UInt32(1)
+        chosen = [self.types.UInt32(index) + dr.select(u < f, one, 0) for index, f, u in zip(low, frac, numbers, strict=True)]
         return dr.gather(self.types.Float, self._grid.data, self._grid.place(chosen, active), active)
 
     def _cells(self, unit: Any) -> tuple[list[Any], list[Any]]:

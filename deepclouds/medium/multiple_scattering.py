@@ -21,6 +21,8 @@ from deepclouds.medium.phase import as_lobes, hg, rotate_to, sample_hg_cosine, s
 
 # Lanes begin walks at every so many steps.
 _TURN = 4
+# Walks with less weight than this under every albedo go on with a chance, and then with this weight.
+_FAINT = 0.1
 
 
 def trace_walks(
@@ -34,6 +36,7 @@ def trace_walks(
     seed: int,
     lanes: int = 4096,
     connect: float = 1.0,
+    roulette: bool = False,
 ) -> NDArray[np.float32]:
     """Unbiased estimates of ``4 pi J / (albedo^2 E)``, one for every walk.
 
@@ -61,6 +64,9 @@ def trace_walks(
     connect
         a collision is connected to a sun with probability ``min(1, connect * 4 pi p)``, weighted by its inverse: the connections
         that carry little are thinned out, without bias.
+    roulette
+        end most of the walks that have lost nine tenths of their weight under every albedo, and let the others stand for them. A walk then
+        depends on the albedos.
 
     Returns
     -------
@@ -84,7 +90,7 @@ def trace_walks(
     counter = dr.zeros(types.UInt32, 1)
     key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
     dr.make_opaque(result, counter, key)
-    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect)
+    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect, roulette and bool(np.any(albedos < 1)))
     return np.array(result).reshape(n, walks, k_suns, m_albedos)
 
 
@@ -134,6 +140,17 @@ def _stream(types: Any, key: Any, number: Any) -> list[Any]:
     return [types.UInt32(z & 0xFFFFFFFF) | 1, types.UInt32(z >> 32)]
 
 
+def _thinned(types: Any, rng: list[Any], weight: list[Any], active: Any) -> tuple[list[Any], Any, list[Any]]:
+    """Russian roulette of walks whose weights are all below `_FAINT`: the next random state, who is lost, and the weights of the others."""
+    heaviest = weight[0]
+    for value in weight[1:]:
+        heaviest = dr.maximum(heaviest, value)
+    faint = active & (heaviest < _FAINT)
+    rng, u = _uniform(types, rng)
+    gain = dr.select(faint, _FAINT / dr.maximum(heaviest, 1e-30), 1)
+    return rng, faint & (u * _FAINT >= heaviest), [value * gain for value in weight]
+
+
 def _phase(lobes: list[Any], cos_theta: Any) -> Any:
     return hg(cos_theta, *lobes) if len(lobes) == 1 else two_lobe(cos_theta, *lobes)
 
@@ -143,7 +160,18 @@ def _sample_cosine(lobes: list[Any], u: Any) -> Any:
 
 
 @dr.syntax
-def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, counter: Any, result: Any, lanes: int, connect: float) -> None:
+def _loop(
+    field: Field,
+    queries: _Queries,
+    walks: int,
+    total: int,
+    key: Any,
+    counter: Any,
+    result: Any,
+    lanes: int,
+    connect: float,
+    roulette: bool,
+) -> None:
     types = field.types
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     k_suns, m_albedos = len(queries.suns), len(queries.albedos)
@@ -240,3 +268,6 @@ def _loop(field: Field, queries: _Queries, walks: int, total: int, key: Any, cou
         for m in range(m_albedos):
             weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
         ended |= traced & ~inside & ~shadow
+        if roulette:
+            rng, lost, weight = _thinned(types, rng, weight, turn)
+            ended |= lost

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _phase, _Queries, _sample_cosine, _stream, _three_uniform, _uniform
+from deepclouds.medium.multiple_scattering import _TURN, _phase, _Queries, _sample_cosine, _stream, _thinned, _three_uniform, _uniform
 from deepclouds.medium.phase import as_lobes, rotate_to
 
 # What a lane is tracing: the walk, the shadow of a vertex, a side branch, the shadow of the branch's end.
@@ -39,12 +39,13 @@ def trace_one_sun(
     lanes: int = 4096,
     connect: float = 1.0,
     varying: AlbedoField | None = None,
+    roulette: bool = False,
 ) -> NDArray[np.float32]:
     """Unbiased estimates of ``4 pi J / (albedo^2 E)``, one for every walk: `trace_walks` for one sun, with less noise.
 
     Parameters
     ----------
-    field, points, directions, phase, albedos, walks, seed, lanes
+    field, points, directions, phase, albedos, walks, seed, lanes, roulette
         as for `deepclouds.medium.multiple_scattering.trace_walks`.
     suns
         (n, 3) unit vectors TOWARD the sun.
@@ -76,7 +77,8 @@ def trace_one_sun(
     counter = dr.zeros(types.UInt32, 1)
     key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
     dr.make_opaque(result, counter, key)
-    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect, varying)
+    roulette = roulette and bool(varying is not None or np.any(albedos < 1))
+    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect, varying, roulette)
     return np.array(result).reshape(n, walks, m_albedos)
 
 
@@ -92,6 +94,7 @@ def _loop(
     lanes: int,
     connect: float,
     varying: AlbedoField | None,
+    roulette: bool,
 ) -> None:
     types = field.types
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
@@ -220,6 +223,9 @@ def _loop(
         density = dr.select(turn, _phase(lobes, cosine), density)
         rival = dr.select(turn, 1, rival)
         ended |= gone & walking
+        if roulette:
+            rng, lost, weight = _thinned(types, rng, weight, turn & ~begun)
+            ended |= lost
         distance = dr.select(over | begun, 0, distance)
         task = dr.select(shadow, UInt32(_SHADOW), dr.select(branch, UInt32(_BRANCH), dr.select(landed, UInt32(_BRANCH_SHADOW), task)))
         task = dr.select(turn, UInt32(_WALK), task)

@@ -124,9 +124,9 @@ class Walks:
         many = np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos)))
         start, ahead = points.astype(np.float32), along.astype(np.float32)
         if len(toward) == 1:
-            j = trace_one_sun(cloud.field, start, ahead, phase, toward[0], many, 1, key)
+            j = trace_one_sun(cloud.field, start, ahead, phase, toward[0], many, 1, key, roulette=True)
         else:
-            j = trace_walks(cloud.field, start, ahead, phase, np.stack(toward, axis=1), many, 1, key)[:, 0]
+            j = trace_walks(cloud.field, start, ahead, phase, np.stack(toward, axis=1), many, 1, key, roulette=True)[:, 0]
         j = j.reshape(n, len(toward), len(albedos))
         for k, irradiance in enumerate(arriving):
             for c, a in enumerate(cloud.albedo):

@@ -21,7 +21,7 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds_runtime.lights import Beam, LightSource, Shade
 from deepclouds_runtime.march import depths
-from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_around
+from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_around, root_nodes
 from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
@@ -34,6 +34,8 @@ _CHECKS, _LEAST_CHECKS = 512, 64
 # Queries that are prepared together.
 _AT_ONCE = 16384
 _DEEP = 1e6
+# Of a budget of queries, what the corners of the coarsest cells may take.
+_OVERDRAWN = 4
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,8 @@ def frame_source(
     root
         edge of the coarsest cells in units of length (mean free paths).
     tolerance, budget
-        see `Octree`; `budget` counts queries.
+        see `Octree`; `budget` counts queries. The corners of the coarsest cells may take four times as many: where they would take more,
+        these cells are larger.
     combine
         makes the fields (n, l) that are interpolated of the values (eyes, n, k).
     every
@@ -252,8 +255,13 @@ def frame_source(
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
-    lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, root * network.descriptor.unit, network.anchor)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
+    spacing = root * network.descriptor.unit
+    while True:
+        lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
+        if lattice.size.max() <= 2 or root_nodes(lattice, seen.points, _OVERDRAWN * nodes) <= _OVERDRAWN * nodes:
+            break
+        spacing = max(spacing, lattice.spacing) * (1.26 if network.anchor is None else 2.0)
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
     checks = min(max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes))), len(seen.points) // 2)
     held_out, built_for = _split(seen, checks)

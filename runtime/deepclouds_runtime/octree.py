@@ -103,6 +103,19 @@ def lattice_around(lengths: Array, corner: Array, axes: Array, spacing: float, a
     return Lattice(corner - axes @ (0.5 * (size * spacing - lengths)), axes, spacing, size)
 
 
+def root_nodes(lattice: Lattice, points: Array, enough: int) -> int:
+    """Corners of the root cells that hold world points (n, 3); a bound on their number where that is at most `enough`."""
+    bound = int(np.prod(lattice.size + 1))
+    if bound <= enough:
+        return bound
+    cells = np.zeros(tuple(lattice.size), bool)
+    cells[tuple(np.clip(lattice.local(points), 0, lattice.size - 1e-6).astype(np.int64).T)] = True
+    corners = np.zeros(tuple(lattice.size + 1), bool)
+    for x, y, z in _CORNERS:
+        corners[x : x + cells.shape[0], y : y + cells.shape[1], z : z + cells.shape[2]] |= cells
+    return int(corners.sum())
+
+
 class Octree:
     """Values at the corners of adaptive cells; see the module.
 

@@ -168,6 +168,7 @@ class WalkScattering:
             self._walks,
             seed,
             varying=self._varying,
+            roulette=True,
         )
         mean: NDArray[np.float32] = values.mean(axis=1)
         return mean

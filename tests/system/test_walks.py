@@ -15,6 +15,7 @@ from scipy import ndimage, stats
 from deepclouds.backend import backend
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
+from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.medium.phase import as_lobes, sample_two_lobe_cosine, two_lobe_numpy
 from deepclouds.volume import Volume
@@ -65,14 +66,22 @@ def lobes(phase: Phase, count: int = 1) -> Singles:
 
 
 def trace(
-    field: Field, points: Singles, w: Singles, phase: Phase, suns: Singles, albedos: list[float], walks: int, seed: int, **more: float
+    field: Field,
+    points: Singles,
+    w: Singles,
+    phase: Phase,
+    suns: Singles,
+    albedos: list[float],
+    walks: int,
+    seed: int,
+    lanes: int = 4096,
+    connect: float = 1.0,
 ) -> Singles:
     """`trace_walks` with one phase function and one list of albedos; suns (n, k, 3) or (k, 3)."""
     n = len(points)
     suns = np.broadcast_to(suns, (n, *suns.shape[-2:]))
-    lanes = int(more.pop("lanes", 4096))
     columns = np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos)))
-    return trace_walks(field, points, w, lobes(phase, n), suns, columns, walks, seed, lanes=lanes, **more)
+    return trace_walks(field, points, w, lobes(phase, n), suns, columns, walks, seed, lanes=lanes, connect=connect)
 
 
 def exit_distance(o: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -212,6 +221,28 @@ def test_roulette_of_the_connections_keeps_the_mean() -> None:
         assert abs(difference.sum()) < 4 * np.sqrt(variance.sum())
         z = difference / np.sqrt(variance)
         assert np.abs(z).max() < stats.norm.isf(1e-3 / 2 / z.size)
+
+
+@pytest.mark.parametrize("one_sun", [False, True])
+def test_roulette_of_faint_walks_keeps_the_mean(one_sun: bool) -> None:
+    """Under albedos of which a walk soon has little left, each point and over all; the least faint albedo decides."""
+    field = cloud()
+    points, w, suns = inside(field, 60, 66), sphere(60, 67), sphere(1, 68)
+    albedos, walks = np.broadcast_to(np.array([0.5, 0.8], np.float32), (60, 2)), 20_000
+    sets, same = [], 0.0
+    for roulette, seed in ((False, 69), (True, 70)):
+        own = np.broadcast_to(suns, (60, 1, 3))
+        if one_sun:
+            j = trace_one_sun(field, points, w, lobes(0.6, 60), own[:, 0], albedos, walks, seed, roulette=roulette)
+        else:
+            j = trace_walks(field, points, w, lobes(0.6, 60), own, albedos, walks, seed, roulette=roulette)[:, :, 0]
+        sets.append((j.astype(np.float64).mean(axis=1), j.astype(np.float64).var(axis=1) / walks))
+        same = np.count_nonzero(j) - same
+    assert same < 0
+    difference, variance = sets[0][0] - sets[1][0], sets[0][1] + sets[1][1]
+    assert np.sqrt(variance.sum()) < 0.02 * sets[0][0].sum()
+    assert abs(difference.sum()) < 4 * np.sqrt(variance.sum())
+    assert np.abs(difference / np.sqrt(variance)).max() < stats.norm.isf(1e-3 / 2 / difference.size)
 
 
 def test_lobes_of_one_kind_are_one_lobe() -> None:

@@ -11,7 +11,7 @@ import pytest
 from deepclouds_runtime.all_round import DIRECTIONS, fit, harmonics, spread
 from deepclouds_runtime.lights import median_cut
 from deepclouds_runtime.march import depths, gathered
-from deepclouds_runtime.octree import Lattice, Octree, lattice_around
+from deepclouds_runtime.octree import Lattice, Octree, lattice_around, root_nodes
 from numpy.typing import NDArray
 
 from deepclouds.backend import backend
@@ -97,6 +97,20 @@ def test_the_budget_bounds_the_nodes() -> None:
     bounded = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), 1e-4, 1000, 8).statistics.nodes
     assert free > 3000
     assert bounded < 1500
+
+
+def test_corners_of_the_root_cells_are_counted() -> None:
+    lattice, asked = _lattice(0.1), list[int]()
+    points = _points(300, 8)
+    points = points[(points - CORNER) @ TURN[:, 0] < 0.5]
+
+    def kept(places: NDArray[np.float64]) -> NDArray[np.float32]:
+        asked.append(len(places))
+        return _bump(places)
+
+    Octree(lattice, kept, points, np.ones(len(points)), 1.0, 10**6, 0)
+    assert 0 < root_nodes(lattice, points, 1) == asked[0] < 0.8 * np.prod(lattice.size + 1)
+    assert root_nodes(lattice, points, 10**9) == np.prod(lattice.size + 1)
 
 
 def test_a_change_between_the_nodes_arrives_there() -> None:
