@@ -37,7 +37,8 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
         rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
     rows += list(_audit_rows(statistics.audit))
     for name, source in statistics.sources.items():
-        took = f"{source['nodes']:,} nodes, {source['queries']:,} queries, error at a point {100 * source['error']:.2g} %"
+        took = f"{source['nodes']:,} nodes, {source['queries']:,} queries{_of(source['model'])}"
+        took += f", error at a point {100 * source['error']:.2g} %"
         rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
     counts = {name.replace("_", " "): count for name, count in asdict(result.counts).items() if name != "skipped"}
     if statistics.mode == "path-traced":
@@ -62,6 +63,10 @@ def _audit_rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         factors, deviations = (", ".join(f"{v:.3g}" for v in dict.fromkeys(found["thrown"][name])) for name in ("factor", "deviation"))
         yield "light thrown on surfaces", f"multiplied by {factors} (walks; standard deviation {deviations})"
     yield "walks that measured it", f"{found['walks']:,}" + ("" if found["corrected"] else ", no correction made")
+
+
+def _of(model: str) -> str:
+    return f" of '{model}'" if model else ""
 
 
 def _measured(error: dict[str, Any]) -> str:

@@ -27,6 +27,7 @@ from deepclouds_runtime.film import Film
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_beams, from_source, from_suns, seen_by
 from deepclouds_runtime.lights import Environment
 from deepclouds_runtime.result import Image
+from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.surfaces import diffuse_share, reflected, reflected_from_cloud
@@ -76,6 +77,9 @@ class Frame:
         whether surfaces receive the cloud's light.
     depths
         collisions of a camera ray that get shadow rays; None chooses by the lights.
+    quick
+        a quicker network than the cloud's, asked about light from all around and about what surfaces see, which walks correct later; None
+        asks the cloud's.
     sampled
         whether multiple scattering is sampled at one of these collisions, past the orders that are exact, in place of interpolated.
     counts, seconds
@@ -101,6 +105,7 @@ class Frame:
     seed: int
     interreflection: bool
     depths: int | None = None
+    quick: NetworkScattering | None = None
     sampled: bool = False
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -125,6 +130,10 @@ class Frame:
             "equal colour channels": sum(s.queries for s in self.sources) // max(distinct, 1) * (len(self.cloud.albedo) - distinct),
             "suns without power": sum(max(sun.irradiance) <= 0 for sun in self.on_cloud.suns),
         }
+
+    @property
+    def _roughly(self) -> Cloud:
+        return self.cloud if self.quick is None else replace(self.cloud, scattering=self.quick)
 
     @property
     def thrower(self) -> Cloud:
@@ -167,7 +176,7 @@ class Frame:
             for source, _ in self.on_surfaces.sources:
                 lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
             self.all_round = AllRound(
-                self.cloud, lights, seen, ahead[seen.rays], counts[seen.rays], _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4
+                self._roughly, lights, seen, ahead[seen.rays], counts[seen.rays], _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4
             )
             self.counts.queries += self.all_round.queries
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
@@ -185,7 +194,7 @@ class Frame:
             lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.
         wide = 2 * _THROWN * tolerance
-        first.again = AllRound(self.cloud, lights, first.seen, first.along, first.counts, _ROOT_AROUND, wide, _BUDGET // 4)
+        first.again = AllRound(self._roughly, lights, first.seen, first.along, first.counts, _ROOT_AROUND, wide, _BUDGET // 4)
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
@@ -231,7 +240,7 @@ class Frame:
         of_suns *= _CORRECTED if corrected else 1.0
         found = {
             "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, of_suns, _BUDGET),
-            "light from all around": frame_source(self.cloud, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET),
+            "light from all around": frame_source(self._roughly, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET),
         }
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())

@@ -56,6 +56,8 @@ class FrameSource:
         asked of the network.
     lights
         directions that light comes from.
+    model
+        name of the network that was asked; empty for one without a file.
     doubt
         two more fields, where the network knows its errors: the sum of `octree`'s, and the error to expect of it.
     built
@@ -68,6 +70,7 @@ class FrameSource:
     error: float
     queries: int
     lights: int
+    model: str = ""
     doubt: DeviceOctree | None = None
     built: Octree | None = None
 
@@ -102,7 +105,14 @@ class FrameSource:
     def summary(self) -> dict[str, Any]:
         """What it took, for a report."""
         made = self.statistics
-        return {"lights": self.lights, "nodes": made.nodes, "queries": self.queries, "refined": made.cells, "error": round(self.error, 4)}
+        return {
+            "model": self.model,
+            "lights": self.lights,
+            "nodes": made.nodes,
+            "queries": self.queries,
+            "refined": made.cells,
+            "error": round(self.error, 4),
+        }
 
     def colours(self, values: list[Any]) -> list[Any]:
         """Colour channels of sums over the fields."""
@@ -269,7 +279,9 @@ def frame_source(
     device = octree.upload(field.types)
     factor, error = _audit(device, predicted, held_out, every)
     doubt = octree.upload(field.types, carried=True) if predicted.carried else None
-    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights), doubt, octree)
+    path = getattr(network.predictor, "path", None)
+    model = "" if path is None else path.stem
+    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights), model, doubt, octree)
 
 
 class _Predicted:

@@ -50,7 +50,8 @@ def load(
     defines
         values for the parameters (``$name``) of a Mitsuba scene file.
     model
-        path of the network; None takes the one that comes with the package.
+        path or name of the network; None takes the one that comes with the package, and so does its name: then corrected images ask the
+        small one about light from all around.
     predictor
         any object with ``predict``, in place of `model`.
     threads
@@ -94,13 +95,16 @@ def load(
     if threads is not None:
         _set_threads(threads)
     scene = _scene(source, path, dict(defines or {}), grid, clamp, ignore_emission, fixed, turn, options)
+    quick = None
     if predictor is None and scene.max_depth != 2 and not how.get("unbiased"):
-        from deepclouds_runtime.predictor import Predictor
+        from deepclouds_runtime.predictor import RELEASED, Predictor
 
         predictor = Predictor(None if model is None else fspath(model), threads)
+        if model in (None, RELEASED[0]) and (scene.environment is not None or scene.surfaces is not None):
+            quick = Predictor(RELEASED[-1], threads)
     if fixed is not None:
         how = {"unit": fixed.unit, "origin": fixed.origin, **how}
-    return Renderer(scene, predictor, load_seconds=time.perf_counter() - started, **how)
+    return Renderer(scene, predictor, quick, load_seconds=time.perf_counter() - started, **how)
 
 
 def _set_threads(threads: int) -> None:

@@ -51,6 +51,9 @@ class Renderer:
         what `deepclouds_runtime.scene.read_scene` returns.
     predictor
         the network; not needed with `unbiased` or in a scene with ``max_depth = 2``.
+    quick
+        a quicker one, which corrected images ask about light from all around and about what surfaces see, where that is many queries for
+        little light each.
     unbiased
         whether J comes from Monte Carlo walks, one a sample, in place of the network.
     exact_orders
@@ -90,6 +93,7 @@ class Renderer:
         self,
         scene: CloudScene,
         predictor: Predicts | None = None,
+        quick: Predicts | None = None,
         *,
         unbiased: bool = False,
         exact_orders: int = 1,
@@ -143,8 +147,11 @@ class Renderer:
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
             if not extrapolate:
                 self._network, self._walks = None, True
+        self._quick: NetworkScattering | None = None
         self.model_hash: str | None = None
         if self._network is not None:
+            if quick is not None and not _unknown(self._network, quick, scene):
+                self._quick = self._network.asking(quick)
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
 
@@ -245,7 +252,8 @@ class Renderer:
         exact = 1 if self._walks else self._exact_orders
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo), self._lights()
         camera = Camera(types, scene.sensor)
-        frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, sampled=sampled)
+        quick = self._quick if correct else None
+        frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, sampled=sampled)
         frame.spent("lights", started)
         if adaptive and not self._walks and partial is not None:
             clock = time.perf_counter()
@@ -285,8 +293,8 @@ class Renderer:
         """Predict what the frame interpolates, and see what surfaces send to the cloud; False where somebody stopped it."""
         adaptive = self.mode == "fast" and not self._walks
         try:
-            if self._network is not None:
-                self._network.stop = interrupted
+            for network in filter(None, (self._network, self._quick)):
+                network.stop = interrupted
             if adaptive and self._interreflection:
                 frame.prepare_thrown(_INTERPOLATION * error)
             if self._interreflection:
@@ -300,14 +308,14 @@ class Renderer:
         except Stopped:
             return False
         finally:
-            if self._network is not None:
-                self._network.stop = None
+            for network in filter(None, (self._network, self._quick)):
+                network.stop = None
         return True
 
     def _quick_look(self, frame: Frame, lights: Lights) -> Frame:
         """What a quick look is rendered with: one collision a sample, few nodes, surfaces without the cloud's light."""
         cloud = replace(frame.cloud, exact=1)
-        look = Frame(self.scene, frame.camera, cloud, lights, lights, self._types, frame.seed, False, depths=1)
+        look = Frame(self.scene, frame.camera, cloud, lights, lights, self._types, frame.seed, False, depths=1, quick=self._quick)
         look.prepare(math.inf, quick=True)
         return look
 

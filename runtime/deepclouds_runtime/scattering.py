@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -77,9 +78,18 @@ class NetworkScattering:
         self.descriptor = Descriptor(field, unit, origin)
         # What is built on the field is aligned to it too.
         self.anchor = origin
-        self.predictor = predictor
         self.stop: Callable[[], bool] | None = None
         self._types = field.types
+        self._ask(predictor)
+
+    def asking(self, predictor: Predicts) -> NetworkScattering:
+        """The same with another network, which shares the filtered levels."""
+        other = copy(self)
+        other._ask(predictor)
+        return other
+
+    def _ask(self, predictor: Predicts) -> None:
+        self.predictor = predictor
         trusted = getattr(getattr(predictor, "metadata", None), "trust", None) is not None
         self._errors: Callable[..., NDArray[np.float32]] | None = getattr(predictor, "errors", None) if trusted else None
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from deepclouds_runtime import correction
+from deepclouds_runtime import correction, frame
 from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
@@ -281,3 +281,24 @@ def test_no_walks_correct_nothing() -> None:
     nothing = Correction(Sums(np.zeros(3), np.zeros(3), np.ones(1)))
     assert nothing.levels == 0
     assert not nothing(np.random.default_rng(1).random((10, 3))).any()
+
+
+@pytest.mark.parametrize(("correct", "model", "around"), [(True, None, "fast"), (False, None, "accurate"), (True, "fast", "fast")])
+def test_light_from_all_around_is_asked_of_the_quick_model(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, correct: bool, model: str | None, around: str
+) -> None:
+    """Expected behaviour: where walks correct it, light from all around and on surfaces; suns are asked of the model that was chosen."""
+    for name in ("_BEAMS", "_BEAMS_THROWN", "_BEAMS_BACK"):
+        monkeypatch.setattr(frame, name, 1)
+    floor = (
+        '<emitter type="constant"/><shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/>'
+        '<translate y="-1.5"/></transform><bsdf type="diffuse"/></shape></scene>'
+    )
+    scene.write_text(scene.read_text().replace("</scene>", floor))
+    monkeypatch.setattr(frame, "_BRIGHT", 2.0)
+    found = load(scene, model=model).render(1, seed=3, correct=correct).statistics.sources
+    assert {name: source["model"] for name, source in found.items()} == {
+        "suns": model or "accurate",
+        "light from all around": around,
+        "light on surfaces": around,
+    }
