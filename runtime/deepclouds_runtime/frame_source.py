@@ -266,12 +266,13 @@ def frame_source(
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
-    spacing = root * network.descriptor.unit
+    spacing, most = root * network.descriptor.unit, _OVERDRAWN * nodes
     while True:
         lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
-        if lattice.size.max() <= 2 or root_nodes(lattice, seen.points, _OVERDRAWN * nodes) <= _OVERDRAWN * nodes:
+        corners = root_nodes(lattice, seen.points, most)
+        if corners <= most or lattice.size.max() <= 2:
             break
-        spacing = max(spacing, lattice.spacing) * (1.26 if network.anchor is None else 2.0)
+        spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
     checks = min(max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes))), len(seen.points) // 2)
     held_out, built_for = _split(seen, checks)

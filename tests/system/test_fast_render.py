@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deepclouds_runtime import frame
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.result import RenderResult
 from numpy.typing import NDArray
@@ -152,6 +153,19 @@ def test_samples_cost_no_queries(folder: Path) -> None:
     few, many = renderer.render(1), renderer.render(64)
     assert few.counts.queries == many.counts.queries
     assert many.counts.cloud_samples > 60 * few.counts.cloud_samples
+
+
+@pytest.mark.parametrize("budget", [10, 100])
+def test_the_coarsest_cells_keep_to_the_budget(folder: Path, monkeypatch: pytest.MonkeyPatch, budget: int) -> None:
+    """Expected behaviour: their corners take no more than four times of it, and the image's mean stays."""
+    renderer = load(_file(folder, "dense"), predictor=Smooth())
+    free = renderer.render(4, seed=5)
+    monkeypatch.setattr(frame, "_BUDGET", budget)
+    bounded = renderer.render(4, seed=5)
+    before, after = (result.statistics.sources["suns"] for result in (free, bounded))
+    assert before["nodes"] > 800
+    assert after["nodes"] <= 4 * budget + 8
+    assert np.mean(bounded.rgb) == pytest.approx(np.mean(free.rgb), rel=0.1)
 
 
 def test_the_dial_sets_the_noise(folder: Path) -> None:
