@@ -150,13 +150,20 @@ def _choose(file: Path, headers: Sequence[_openvdb.Header], grid: str | None) ->
         raise InputError(
             f"{file}: name the grid to read; there is no single float grid, and no single one called 'density'. Grids: {listing}"
         )
+    return _named(file, headers, grid, ("float",))
+
+
+def _named(file: Path, headers: Sequence[_openvdb.Header], grid: str, kinds: tuple[str, ...]) -> int:
+    """Index of the grid called `grid`, which has to hold values of one of the `kinds`."""
+    listing = ", ".join(f"{h['unique_name']} ({h['value_type']})" for h in headers) or "none"
     matches = [i for i, h in enumerate(headers) if h["unique_name"] == grid] or [i for i, h in enumerate(headers) if h["name"] == grid]
     if not matches:
         raise InputError(f"{file}: no grid called '{grid}'. Grids: {listing}")
     if len(matches) > 1:
         raise InputError(f"{file}: {len(matches)} grids are called '{grid}'; add the number in brackets. Grids: {listing}")
-    if headers[matches[0]]["value_type"] != "float":
-        raise InputError(f"{file}: the grid '{grid}' holds {headers[matches[0]]['value_type']} values, not float. Grids: {listing}")
+    kind = headers[matches[0]]["value_type"]
+    if kind not in kinds:
+        raise InputError(f"{file}: the grid '{grid}' holds {kind} values, not {' or '.join(kinds)}. Grids: {listing}")
     return matches[0]
 
 
@@ -201,22 +208,64 @@ def read_vdb(path: str | PathLike[str], grid: str | None = None, clamp: bool = F
         info, density, places, values = _openvdb.read_floats(str(file), index, dense_voxels, MAX_VOXELS, MAX_BOX)
     if info["grid_class"] == "level set":
         raise InputError(f"{source} is a level set, a distance to a surface; convert it to a fog volume first")
-    if info["index_to_world"] is None:
-        raise InputError(f"{source} has a {info['transform_type']}, which is not affine; resample it to an affine transform first")
     if info["background"] != 0:
         raise InputError(f"{source} has the background value {info['background']:g}: it is not empty outside; set its background to 0")
+    (nx, ny, nz), to_world = _placed(info, source)
+    if density is not None:
+        return Volume(clean(density, source, clamp), to_world)
+    assert places is not None
+    assert values is not None
+    return SparseVolume(Bricks((nz, ny, nx), places, clean(values, source, clamp)), to_world)
+
+
+def _placed(info: _openvdb.Description, source: str) -> tuple[tuple[int, int, int], NDArray[np.float64]]:
+    """Voxels of a grid's box along x, y and z, and the map from the box's unit cube to the world."""
+    if info["index_to_world"] is None:
+        raise InputError(f"{source} has a {info['transform_type']}, which is not affine; resample it to an affine transform first")
     if info["index_box"] is None:
         raise InputError(f"{source} is empty: it has no active voxel")
     lower, upper = (np.array(corner, np.int64) for corner in info["index_box"])
     nx, ny, nz = (int(n) for n in upper - lower + 1)
     unit_to_index = np.diag([float(nx), ny, nz, 1.0])
     unit_to_index[:3, 3] = lower - 0.5
-    to_world = np.array(info["index_to_world"], np.float64) @ unit_to_index
-    if density is not None:
-        return Volume(clean(density, source, clamp), to_world)
-    assert places is not None
+    return (nx, ny, nz), np.array(info["index_to_world"], np.float64) @ unit_to_index
+
+
+def read_vdb_values(path: str | PathLike[str], grid: str) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Read a grid of numbers or colours, of any meaning, cropped to the box of its active voxels.
+
+    Parameters
+    ----------
+    path
+        a .vdb file.
+    grid
+        name of a grid of floats or of three floats (``vec3s``).
+
+    Returns
+    -------
+    values (nz, ny, nx, channels), as `read_vdb` takes them over, and the 4 x 4 map from the unit cube of the box to the world.
+
+    Raises
+    ------
+    InputError
+        when the file is missing or damaged, or has no such grid; for one without active voxels, of another type, of more than `MAX_VOXELS`
+        values, or with a transform that is not affine.
+    """
+    file = _existing(path)
+    with _native_errors(file):
+        headers = _openvdb.read_headers(str(file))
+    index = _named(file, headers, grid, ("float", "vec3s"))
+    source = f"{file}: the grid '{headers[index]['unique_name']}'"
+    info: _openvdb.Description
+    values: NDArray[np.float32] | None
+    with _native_errors(file):
+        if headers[index]["value_type"] == "float":
+            info, values, _, _ = _openvdb.read_floats(str(file), index, MAX_VOXELS, MAX_VOXELS, MAX_VOXELS)
+        else:
+            info, values = _openvdb.read_vectors(str(file), index, MAX_VOXELS // 3)
+    (nx, ny, nz), to_world = _placed(info, source)
     assert values is not None
-    return SparseVolume(Bricks((nz, ny, nx), places, clean(values, source, clamp)), to_world)
+    return values.reshape(nz, ny, nx, -1), to_world
 
 
 def kept_in_bricks(voxels: int, bricks: int, dense_voxels: int = DENSE_VOXELS) -> bool:

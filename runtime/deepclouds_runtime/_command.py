@@ -178,6 +178,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     volume.add_argument("--view", type=_numbers((2,)), metavar=_PAIR, help="where the camera stands, degrees, like --sun (default 0,5)")
     volume.add_argument("--size", type=_size, metavar="WxH", help="pixels (default 640x480)")
     volume.add_argument("--grid", metavar="NAME", help="grid in a .vdb file")
+    volume.add_argument("--albedo-grid", metavar="NAME", help="grid in a .vdb file that is the albedo, numbers or colours")
     volume.add_argument("--clamp", action="store_true", help="set negative values and NaN in the file to 0")
     volume.add_argument("--ignore-emission", action="store_true", help="render what a fire scatters, without the light that it gives off")
     return parser
@@ -192,7 +193,9 @@ def run(argv: Sequence[str], prog: str) -> int:
     """Parse `argv`, render and write; returns 0, or 130 when it was interrupted; raises InputError for bad input."""
     arguments = _parser(prog).parse_args(_negative_pairs(argv))
     made = plan(arguments)
-    options: dict[str, Any] = {k: getattr(arguments, k) for k in (*_VOLUME, *_BOTH, "sensor", "grid") if getattr(arguments, k) is not None}
+    options: dict[str, Any] = {
+        k: getattr(arguments, k) for k in (*_VOLUME, *_BOTH, "sensor", "grid", "albedo_grid") if getattr(arguments, k) is not None
+    }
     if arguments.clamp:
         options["clamp"] = True
     if arguments.ignore_emission:

@@ -10,10 +10,14 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from deepclouds.errors import InputError
+from deepclouds.medium.albedo import AlbedoGrid
 from deepclouds.volume import read_volume
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.key_frames import Fixed, with_extinction
+from deepclouds_runtime.lights import luminance
 from deepclouds_runtime.renderer import Renderer
 from deepclouds_runtime.scattering import Predicts
 from deepclouds_runtime.scene import CloudScene, read_scene
@@ -36,6 +40,7 @@ def load(
     threads: int | None = None,
     grid: str | None = None,
     clamp: bool = False,
+    albedo_grid: str | None = None,
     ignore_emission: bool = False,
     fixed: Fixed | None = None,
     turn: int = 1,
@@ -58,6 +63,8 @@ def load(
         threads for everything; None takes all cores.
     grid, clamp
         name of the grid in a .vdb file; set negative values and NaN to 0.
+    albedo_grid
+        name of a grid of the .vdb file, of floats or colours, that is the single-scattering albedo.
     ignore_emission
         render what the cloud scatters where a .vdb file says that it gives off light of its own, in place of refusing it.
     fixed
@@ -94,7 +101,7 @@ def load(
     mitsuba(select=is_path)
     if threads is not None:
         _set_threads(threads)
-    scene = _scene(source, path, dict(defines or {}), grid, clamp, ignore_emission, fixed, turn, options)
+    scene = _scene(source, path, dict(defines or {}), grid, clamp, albedo_grid, ignore_emission, fixed, turn, options)
     quick = None
     if predictor is None and scene.max_depth != 2 and not how.get("unbiased"):
         from deepclouds_runtime.predictor import RELEASED, Predictor
@@ -123,6 +130,7 @@ def _scene(
     defines: dict[str, str],
     grid: str | None,
     clamp: bool,
+    albedo_grid: str | None,
     ignore_emission: bool,
     fixed: Fixed | None,
     turn: int,
@@ -132,24 +140,48 @@ def _scene(
         if defines:
             raise InputError(f"{path}: -D{next(iter(defines))} has no meaning for a volume; it sets a parameter of a scene file")
         wanted = options_from(options)
+        varying = None if albedo_grid is None else _albedo(path, albedo_grid, "albedo" in options)
         volume = read_volume(path, grid, clamp)
-        notes = _left_out(path, grid, ignore_emission)
+        notes = _left_out(path, grid, albedo_grid, ignore_emission)
         if fixed is None:
             scene = volume_scene(volume, wanted, str(path), turn=turn)
         else:
             scene = volume_scene(volume, with_extinction(wanted, fixed), str(path), fixed.corners, turn)
+        if varying is not None:
+            scene = replace(scene, albedo=varying.largest, varying=varying)
         return replace(scene, notes=scene.notes + notes)
     if path is not None and path.suffix.lower() != ".xml":
         raise InputError(f"{path}: deepclouds renders Mitsuba scenes (.xml) and volumes (.vdb, .vol), not '{path.suffix}'")
     unknown = sorted(set(options) - set(SCENE_OPTIONS))
     if unknown:
         raise InputError(f"{path or 'the scene'}: the option '{unknown[0]}' belongs to a volume; a scene says it itself")
-    if grid is not None or clamp or ignore_emission:
-        raise InputError(f"{path or 'the scene'}: grid, clamp and ignore_emission belong to a volume; a scene says itself what it reads")
+    if grid is not None or clamp or albedo_grid is not None or ignore_emission:
+        raise InputError(
+            f"{path or 'the scene'}: grid, clamp, albedo_grid and ignore_emission belong to a volume; a scene says itself what it reads"
+        )
     return read_scene(source if path is None else load_xml(path, defines), **options)
 
 
-def _left_out(path: Path, grid: str | None, ignore: bool) -> tuple[str, ...]:
+def _albedo(path: Path, grid: str, given: bool) -> AlbedoGrid:
+    """The albedo that a grid of the file holds, one value for each colour channel."""
+    if given:
+        raise InputError(f"albedo_grid = '{grid}': the albedo is given too; leave one of the two out")
+    if path.suffix.lower() != ".vdb":
+        raise InputError(f"albedo_grid = '{grid}': {path} has one grid, its density; a .vdb file may hold an albedo as well")
+    # Loads the native module, so only here.
+    from deepclouds.volume.vdb import read_vdb_values
+
+    values, to_world = read_vdb_values(path, grid)
+    channels = len(mitsuba().Spectrum())
+    if values.shape[3] not in (1, channels):
+        values = luminance(values)[..., None].astype(np.float32)
+    try:
+        return AlbedoGrid(np.broadcast_to(values, (*values.shape[:3], channels)), to_world)
+    except InputError as error:
+        raise InputError(f"{path}: the grid '{grid}': {error}") from error
+
+
+def _left_out(path: Path, grid: str | None, albedo: str | None, ignore: bool) -> tuple[str, ...]:
     """Sentences about a file's other grids; raises InputError for those that give off light, unless we are told to `ignore` it."""
     if path.suffix.lower() != ".vdb":
         return ()
@@ -160,7 +192,8 @@ def _left_out(path: Path, grid: str | None, ignore: bool) -> tuple[str, ...]:
     notes = []
     headers, chosen = chosen_grid(path, grid)
     light = emissive_grids(path, grid)
-    others = [h["unique_name"] for k, h in enumerate(headers) if k != chosen and h["unique_name"] not in light]
+    used = (chosen, *(k for k, h in enumerate(headers) if albedo in (h["unique_name"], h["name"])))
+    others = [h["unique_name"] for k, h in enumerate(headers) if k not in used and h["unique_name"] not in light]
     if light and not ignore:
         raise InputError(
             f"{path}: by its {_named(light)} the cloud gives off light of its own, which deepclouds does not render; "
@@ -169,7 +202,8 @@ def _left_out(path: Path, grid: str | None, ignore: bool) -> tuple[str, ...]:
     if light:
         notes.append(f"light that the cloud gives off by its {_named(light)} is left out")
     if others:
-        notes.append(f"of the file '{headers[chosen]['unique_name']}' alone is rendered, without its {_named(others)}")
+        rendered = " and ".join(repr(headers[k]["unique_name"]) for k in used)
+        notes.append(f"of the file {rendered} alone {'is' if len(used) == 1 else 'are'} rendered, without its {_named(others)}")
     for note in notes:
         _LOG.info("%s: %s", path, note)
     return tuple(notes)

@@ -58,7 +58,7 @@ KEEPING = {
     "--unit": ["0.01"],
     "--skip-existing": [],
 }
-# Not for a volume, or a choice of the network, which has tests of its own.
+# Not for every volume, or a choice of the network, which has tests of its own.
 ELSEWHERE = {
     "--output",
     "--sensor",
@@ -69,6 +69,7 @@ ELSEWHERE = {
     "--exact-orders",
     "--unbiased",
     "--error",
+    "--albedo-grid",
     "--extrapolate",
     "--frames",
     "--turntable",

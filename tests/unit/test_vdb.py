@@ -10,6 +10,7 @@ import pytest
 
 from deepclouds.errors import InputError
 from deepclouds.volume import Bricks, SparseVolume, Volume, _openvdb, list_grids, read_vdb, read_vol, write_vdb
+from deepclouds.volume.vdb import read_vdb_values
 
 DATA = Path(__file__).parent / "data"
 
@@ -69,6 +70,24 @@ def test_a_grid_is_chosen_by_name() -> None:
         read_vdb(several, "smoke")
     with pytest.raises(InputError, match="'wind' holds vec3s"):
         read_vdb(several, "wind")
+
+
+@pytest.mark.parametrize(("name", "channels"), [("Cd", 3), ("grey", 1)])
+def test_values_of_any_meaning_keep_their_place(name: str, channels: int) -> None:
+    values, to_world = read_vdb_values(DATA / "painted.vdb", name)
+    assert values.shape == (7, 9, 11, channels)
+    z, y, x = np.indices(values.shape[:3]) + 0.5
+    unit = np.stack([x / 11, y / 9, z / 7], axis=-1)
+    world = unit @ to_world[:3, :3].T + to_world[:3, 3]
+    expected = np.stack([0.2 + 0.3 * world[..., 0], 0.3 + 0.2 * world[..., 1], np.full(x.shape, 0.5)], axis=-1)
+    np.testing.assert_allclose(values, expected[..., :channels], atol=1e-6)
+
+
+def test_values_of_other_types_are_refused() -> None:
+    with pytest.raises(InputError, match="'label' holds int32 values, not float or vec3s"):
+        read_vdb_values(DATA / "several.vdb", "label")
+    with pytest.raises(InputError, match="no grid called 'smoke'"):
+        read_vdb_values(DATA / "several.vdb", "smoke")
 
 
 def test_a_grid_that_shares_its_voxels_has_its_own_place() -> None:

@@ -232,6 +232,7 @@ nb::dict describe_grid(const std::string& path, std::size_t index) {
 }
 
 using DenseArray = nb::ndarray<nb::numpy, float, nb::ndim<3>, nb::c_contig>;
+// Bricks, or voxels of several components.
 using BrickArray = nb::ndarray<nb::numpy, float, nb::ndim<4>, nb::c_contig>;
 using PlaceArray = nb::ndarray<nb::numpy, std::int32_t, nb::ndim<2>, nb::c_contig>;
 using Freed = std::unique_ptr<void, decltype(&std::free)>;
@@ -428,6 +429,39 @@ nb::tuple read_floats(const std::string& path, std::size_t index, std::uint64_t 
     return nb::make_tuple(info, DenseArray(values, {extent.n[2], extent.n[1], extent.n[0]}, owner), nb::none(), nb::none());
 }
 
+// A grid of three floats a voxel, cropped to its active voxels, as (description, dense array or None): z, y, x, component.
+nb::tuple read_vectors(const std::string& path, std::size_t index, std::uint64_t max_voxels) {
+    Reader reader(path);
+    openvdb::GridBase::Ptr base;
+    {
+        nb::gil_scoped_release release;
+        base = reader.load(index);
+    }
+    const auto grid = openvdb::gridPtrCast<openvdb::Vec3SGrid>(base);
+    if (!grid) {
+        throw VdbError("the grid '" + base->getName() + "' holds " + base->valueType() + " values, not vec3s");
+    }
+    const nb::dict info = describe(reader.at(index), *grid);
+    const openvdb::CoordBBox box = grid->evalActiveVoxelBoundingBox();
+    if (box.empty()) {
+        return nb::make_tuple(info, nb::none());
+    }
+    const Extent extent(box);
+    if (extent.voxels > static_cast<double>(max_voxels)) {
+        throw VdbError("the grid '" + grid->getName() + "' spans " + extent.text() + " voxels, more than the " + std::to_string(max_voxels) +
+                       " that fit");
+    }
+    static_assert(sizeof(openvdb::Vec3s) == 3 * sizeof(float));
+    auto* values = new openvdb::Vec3s[static_cast<std::size_t>(extent.voxels)];
+    const nb::capsule owner(values, [](void* p) noexcept { delete[] static_cast<openvdb::Vec3s*>(p); });
+    {
+        nb::gil_scoped_release release;
+        openvdb::tools::Dense<openvdb::Vec3s, openvdb::tools::LayoutXYZ> dense(box, values);
+        openvdb::tools::copyToDense(*grid, dense);
+    }
+    return nb::make_tuple(info, BrickArray(values->asPointer(), {extent.n[2], extent.n[1], extent.n[0], 3}, owner));
+}
+
 // An empty fog volume with its transform, name and metadata.
 openvdb::FloatGrid::Ptr new_grid(const nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>& index_to_world,
                                  const std::string& name, bool half, const nb::dict& metadata) {
@@ -535,6 +569,7 @@ NB_MODULE(_openvdb, m) {
     m.def("describe_grid", &describe_grid, nb::arg("path"), nb::arg("index"));
     m.def("count_bricks", &count_bricks, nb::arg("path"), nb::arg("index"), nb::arg("max_voxels"));
     m.def("read_floats", &read_floats, nb::arg("path"), nb::arg("index"), nb::arg("dense_voxels"), nb::arg("max_voxels"), nb::arg("max_box"));
+    m.def("read_vectors", &read_vectors, nb::arg("path"), nb::arg("index"), nb::arg("max_voxels"));
     m.def("write_dense", &write_dense, nb::arg("path"), nb::arg("density"), nb::arg("index_to_world"), nb::arg("name"), nb::arg("half"),
           nb::arg("prune"), nb::arg("metadata"));
     m.def("write_bricks", &write_bricks, nb::arg("path"), nb::arg("places"), nb::arg("values"), nb::arg("index_to_world"), nb::arg("name"),

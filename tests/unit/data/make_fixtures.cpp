@@ -50,6 +50,27 @@ int main() {
         label->tree().setValue({0, 0, 0}, 5);
         save("several.vdb", {flames, heat, a, b, shared, wind, label});
     }
+    // A cloud with an albedo on coarser voxels, as colours and as numbers: linear in the world's coordinates.
+    {
+        FloatGrid::Ptr density = fog("density"), grey = fog("grey");
+        density->sparseFill(CoordBBox({0, 0, 0}, {15, 11, 7}), 1.0f, true);
+        density->setTransform(math::Transform::createLinearTransform(0.125));
+        Vec3SGrid::Ptr colour = Vec3SGrid::create(Vec3s(0));
+        colour->setName("Cd");
+        const math::Transform::Ptr coarse = math::Transform::createLinearTransform(0.25);
+        for (int z = -1; z < 6; ++z) {
+            for (int y = -1; y < 8; ++y) {
+                for (int x = -1; x < 10; ++x) {
+                    const Vec3d p = coarse->indexToWorld(Coord(x, y, z));
+                    colour->tree().setValue({x, y, z}, Vec3s(0.2 + 0.3 * p.x(), 0.3 + 0.2 * p.y(), 0.5));
+                    grey->tree().setValue({x, y, z}, 0.2 + 0.3 * p.x());
+                }
+            }
+        }
+        colour->setTransform(coarse);
+        grey->setTransform(coarse->copy());
+        save("painted.vdb", {density, colour, grey});
+    }
     {
         FloatGrid::Ptr grid = fog("density");
         grid->tree().setValue({1, 1, 1}, 1.0f);

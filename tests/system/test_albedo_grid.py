@@ -1,0 +1,76 @@
+"""Rationale: a second grid of a .vdb file can be the albedo; it has to lie where the file has it, in its own colours.
+
+Expected behaviour: single scattering of an opaque cloud shows the albedo at its surface, channel by channel; with all orders a darker side
+stays darker; what does not fit is refused with exit code 2.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from deepclouds.cli import main
+from deepclouds.exr import read_exr
+from deepclouds.volume import Volume, write_vol
+
+# Density in 16 x 12 x 8 voxels of 1/8; albedo (0.2 + 0.3 x, 0.3 + 0.2 y, 0.5) on voxels of 1/4, and its red part as `grey`.
+PAINTED = Path(__file__).parents[1] / "unit" / "data" / "painted.vdb"
+
+
+@pytest.fixture(autouse=True)
+def mi(llvm_mitsuba: ModuleType) -> ModuleType:
+    return llvm_mitsuba
+
+
+def rendered(folder: Path, *flags: str) -> NDArray[np.float64]:
+    fixed = ["--size", "32x24", "--sky", "0", "--sun", "20,15", "--view", "0,0", "--optical-depth", "400", "--g", "0", "--quiet"]
+    assert main(["render", str(PAINTED), "-o", str(folder / "image.exr"), *fixed, *flags]) == 0
+    return read_exr(folder / "image.exr").rgb().astype(np.float64)
+
+
+def test_single_scattering_shows_the_albedo_in_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--max-depth", "2", "--spp", "16"]
+    white, colour, grey = (rendered(tmp_path, *flags, *more) for more in ([], ["--albedo-grid", "Cd"], ["--albedo-grid", "grey"]))
+    rows, columns = np.nonzero(white.min(axis=2) > 0.5 * white.max())
+    ratio = (colour / np.maximum(white, 1e-9))[rows, columns]
+    np.testing.assert_allclose(ratio[:, 2], 0.5, rtol=1e-3)
+    # From +Z, x grows to the right and y upward: what is seen of the front face spans nearly all of both.
+    for channel, place, low, high in ((0, columns, 0.2, 0.8), (1, -rows, 0.3, 0.6)):
+        values = [ratio[place == k, channel].mean() for k in np.unique(place)]
+        assert len(values) > 8
+        assert np.all(np.diff(values) > 0)
+        np.testing.assert_allclose([values[0], values[-1]], [low, high], atol=0.06)
+    of_red = colour[..., :1] / np.maximum(white[..., :1], 1e-9)
+    np.testing.assert_allclose(grey, of_red * white, rtol=1e-3, atol=1e-6)
+
+
+def test_all_orders_and_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = rendered(tmp_path, "--spp", "16", "--albedo-grid", "Cd")
+    lit = image[..., 1] > 0.2 * image[..., 1].max()
+    left, right = (image[:, half][lit[:, half]][:, 0].mean() for half in (slice(0, 16), slice(16, None)))
+    assert right > 1.5 * left
+    out = tmp_path / "image.exr"
+    assert main(["render", str(PAINTED), "-o", str(out), "--size", "8x6", "--spp", "1", "--albedo-grid", "Cd", "--max-depth", "2"]) == 0
+    assert "of the file 'density' and 'Cd' alone are rendered, without its grid 'grey'" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "said"),
+    [
+        ("painted", ["--albedo-grid", "paint"], "no grid called 'paint'"),
+        ("painted", ["--albedo-grid", "Cd", "--albedo", "0.9"], "the albedo is given too"),
+        ("several", ["--albedo-grid", "label", "--grid", "heat"], "'label' holds int32 values, not float or vec3s"),
+        ("several", ["--albedo-grid", "wind", "--grid", "heat"], "'wind': the albedo's grid holds 2 values outside of 0 to 1"),
+        ("plain", ["--albedo-grid", "Cd"], "has one grid, its density"),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, flags: list[str], said: str) -> None:
+    write_vol(tmp_path / "plain.vol", Volume.from_box(np.ones((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1)))
+    file = tmp_path / "plain.vol" if name == "plain" else PAINTED.with_name(f"{name}.vdb")
+    assert main(["render", str(file), "-o", str(tmp_path / "image.exr"), *flags]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "image.exr").exists()
