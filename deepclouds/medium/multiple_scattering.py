@@ -86,12 +86,9 @@ def trace_walks(
         raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
     types = field.types
     queries = _Queries(types, points, directions, as_lobes(phase), suns, albedos)
-    result = dr.zeros(types.Float, total * k_suns * m_albedos)
-    counter = dr.zeros(types.UInt32, 1)
-    key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
-    dr.make_opaque(result, counter, key)
-    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect, roulette and bool(np.any(albedos < 1)))
-    return np.array(result).reshape(n, walks, k_suns, m_albedos)
+    job = _Job(types, walks, total, k_suns * m_albedos, seed, lanes, connect, roulette and bool(np.any(albedos < 1)))
+    _loop(field, queries, job)
+    return np.array(job.result).reshape(n, walks, k_suns, m_albedos)
 
 
 class _Queries:
@@ -108,6 +105,17 @@ class _Queries:
         self.suns = [[upload(suns[:, k, c]) for c in range(3)] for k in range(suns.shape[1])]
         self.albedos = [upload(albedos[:, m]) for m in range(albedos.shape[1])]
         dr.eval(self.points, self.directions, self.lobes, self.suns, self.albedos)
+
+
+class _Job:
+    """How many walks a kernel traces, `total` in all with so many `results` each, and how; what they find, and the next one's number."""
+
+    def __init__(self, types: Any, walks: int, total: int, results: int, seed: int, lanes: int, connect: float, roulette: bool) -> None:
+        self.walks, self.total, self.lanes, self.connect, self.roulette = walks, total, min(lanes, total), connect, roulette
+        self.result = dr.zeros(types.Float, total * results)
+        self.counter = dr.zeros(types.UInt32, 1)
+        self.key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
+        dr.make_opaque(self.result, self.counter, self.key)
 
 
 def _uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any]:
@@ -160,25 +168,15 @@ def _sample_cosine(lobes: list[Any], u: Any) -> Any:
 
 
 @dr.syntax
-def _loop(
-    field: Field,
-    queries: _Queries,
-    walks: int,
-    total: int,
-    key: Any,
-    counter: Any,
-    result: Any,
-    lanes: int,
-    connect: float,
-    roulette: bool,
-) -> None:
+def _loop(field: Field, queries: _Queries, job: _Job) -> None:
     types = field.types
+    result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     k_suns, m_albedos = len(queries.suns), len(queries.albedos)
-    walks_each = dr.opaque(UInt32, walks)
-    limit = dr.opaque(UInt32, total)
-    connect_4pi = dr.opaque(Float, 4.0 * np.pi * connect)
-    least = dr.opaque(Float, 1.0 / connect)
+    walks_each = dr.opaque(UInt32, job.walks)
+    limit = dr.opaque(UInt32, job.total)
+    connect_4pi = dr.opaque(Float, 4.0 * np.pi * job.connect)
+    least = dr.opaque(Float, 1.0 / job.connect)
 
     alive = dr.full(Bool, True, lanes)
     ended = dr.full(Bool, True, lanes)
@@ -268,6 +266,6 @@ def _loop(
         for m in range(m_albedos):
             weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
         ended |= traced & ~inside & ~shadow
-        if roulette:
+        if job.roulette:
             rng, lost, weight = _thinned(types, rng, weight, turn)
             ended |= lost

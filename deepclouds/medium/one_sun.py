@@ -12,15 +12,13 @@ for the branch and for the walk alike, which is never above the smaller of both 
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _phase, _Queries, _sample_cosine, _stream, _thinned, _three_uniform, _uniform
+from deepclouds.medium.multiple_scattering import _TURN, _Job, _phase, _Queries, _sample_cosine, _stream, _thinned, _three_uniform, _uniform
 from deepclouds.medium.phase import as_lobes, rotate_to
 
 # What a lane is tracing: the walk, the shadow of a vertex, a side branch, the shadow of the branch's end.
@@ -73,35 +71,21 @@ def trace_one_sun(
         raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
     types = field.types
     queries = _Queries(types, points, directions, as_lobes(phase), suns[:, None], albedos)
-    result = dr.zeros(types.Float, total * m_albedos)
-    counter = dr.zeros(types.UInt32, 1)
-    key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
-    dr.make_opaque(result, counter, key)
     roulette = roulette and bool(varying is not None or np.any(albedos < 1))
-    _loop(field, queries, walks, total, key, counter, result, min(lanes, total), connect, varying, roulette)
-    return np.array(result).reshape(n, walks, m_albedos)
+    job = _Job(types, walks, total, m_albedos, seed, lanes, connect, roulette)
+    _loop(field, queries, job, varying)
+    return np.array(job.result).reshape(n, walks, m_albedos)
 
 
 @dr.syntax
-def _loop(
-    field: Field,
-    queries: _Queries,
-    walks: int,
-    total: int,
-    key: Any,
-    counter: Any,
-    result: Any,
-    lanes: int,
-    connect: float,
-    varying: AlbedoField | None,
-    roulette: bool,
-) -> None:
+def _loop(field: Field, queries: _Queries, job: _Job, varying: AlbedoField | None) -> None:
     types = field.types
+    result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     m_albedos = len(queries.albedos)
-    walks_each = dr.opaque(UInt32, walks)
-    limit = dr.opaque(UInt32, total)
-    often, least = dr.opaque(Float, connect), dr.opaque(Float, 1.0 / connect)
+    walks_each = dr.opaque(UInt32, job.walks)
+    limit = dr.opaque(UInt32, job.total)
+    often, least = dr.opaque(Float, job.connect), dr.opaque(Float, 1.0 / job.connect)
 
     alive = dr.full(Bool, True, lanes)
     ended = dr.full(Bool, True, lanes)
@@ -223,7 +207,7 @@ def _loop(
         density = dr.select(turn, _phase(lobes, cosine), density)
         rival = dr.select(turn, 1, rival)
         ended |= gone & walking
-        if roulette:
+        if job.roulette:
             rng, lost, weight = _thinned(types, rng, weight, turn & ~begun)
             ended |= lost
         distance = dr.select(over | begun, 0, distance)

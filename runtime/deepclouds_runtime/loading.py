@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,7 @@ def load(
 
         predictor = Predictor(None if model is None else fspath(model), threads)
         if model in (None, RELEASED[0]) and (scene.environment is not None or scene.surfaces is not None):
-            quick = Predictor(RELEASED[-1], threads)
+            quick = partial(Predictor, RELEASED[-1], threads)
     if fixed is not None:
         how = {"unit": fixed.unit, "origin": fixed.origin, **how}
     return Renderer(scene, predictor, quick, load_seconds=time.perf_counter() - started, **how)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,8 @@ class Renderer:
     predictor
         the network; not needed with `unbiased` or in a scene with ``max_depth = 2``.
     quick
-        a quicker one, which corrected images ask about light from all around and about what surfaces see, where that is many queries for
-        little light each.
+        loads a quicker one, which corrected images ask about light from all around and about what surfaces see, where that is many queries
+        for little light each; called for the first of them.
     unbiased
         whether J comes from Monte Carlo walks, one a sample, in place of the network.
     exact_orders
@@ -93,7 +94,7 @@ class Renderer:
         self,
         scene: CloudScene,
         predictor: Predicts | None = None,
-        quick: Predicts | None = None,
+        quick: Callable[[], Predicts] | None = None,
         *,
         unbiased: bool = False,
         exact_orders: int = 1,
@@ -147,13 +148,19 @@ class Renderer:
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
             if not extrapolate:
                 self._network, self._walks = None, True
-        self._quick: NetworkScattering | None = None
+        self._quick = quick
         self.model_hash: str | None = None
         if self._network is not None:
-            if quick is not None and not _unknown(self._network, quick, scene):
-                self._quick = self._network.asking(quick)
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
+
+    @cached_property
+    def _quicker(self) -> NetworkScattering | None:
+        """The quicker network, where there is one that was trained on the scene's medium."""
+        if self._quick is None or self._network is None:
+            return None
+        predictor = self._quick()
+        return None if _unknown(self._network, predictor, self.scene) else self._network.asking(predictor)
 
     @property
     def unit(self) -> float | None:
@@ -252,7 +259,7 @@ class Renderer:
         exact = 1 if self._walks else self._exact_orders
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo), self._lights()
         camera = Camera(types, scene.sensor)
-        quick = self._quick if correct else None
+        quick = self._quicker if correct else None
         frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, sampled=sampled)
         frame.spent("lights", started)
         if adaptive and not self._walks and partial is not None:
@@ -293,7 +300,7 @@ class Renderer:
         """Predict what the frame interpolates, and see what surfaces send to the cloud; False where somebody stopped it."""
         adaptive = self.mode == "fast" and not self._walks
         try:
-            for network in filter(None, (self._network, self._quick)):
+            for network in filter(None, (self._network, frame.quick)):
                 network.stop = interrupted
             if adaptive and self._interreflection:
                 frame.prepare_thrown(_INTERPOLATION * error)
@@ -308,14 +315,14 @@ class Renderer:
         except Stopped:
             return False
         finally:
-            for network in filter(None, (self._network, self._quick)):
+            for network in filter(None, (self._network, frame.quick)):
                 network.stop = None
         return True
 
     def _quick_look(self, frame: Frame, lights: Lights) -> Frame:
         """What a quick look is rendered with: one collision a sample, few nodes, surfaces without the cloud's light."""
         cloud = replace(frame.cloud, exact=1)
-        look = Frame(self.scene, frame.camera, cloud, lights, lights, self._types, frame.seed, False, depths=1, quick=self._quick)
+        look = Frame(self.scene, frame.camera, cloud, lights, lights, self._types, frame.seed, False, depths=1, quick=frame.quick)
         look.prepare(math.inf, quick=True)
         return look
 
