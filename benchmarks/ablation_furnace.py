@@ -112,9 +112,7 @@ def furnace_of(shard: Shard, field: Field, points: int, rng: Generator, unit_fac
     cosine = np.sum(w.astype(np.float64) * sun, axis=1)
     p = (share * hg_numpy(cosine, g1) + (1 - share) * hg_numpy(cosine, g2)) / INV_4PI
     o, d = (types.Array3f(np.ascontiguousarray(v.T)) for v in (point, sun))
-    tau = np.array(
-        optical_depth(field, o, d, types.Float(0), types.Float(1e30), types.Float(0.5), types.Bool(np.ones(n, bool))), np.float64
-    )
+    tau = np.array(optical_depth(field, o, d, types.Float(0), types.Float(1e30), types.Bool(np.ones(n, bool))), np.float64)
     stencil = Descriptor(field, unit=unit_factor * default_unit(field)).stencils_numpy(point, w, sun, rng.uniform(0, 2 * np.pi, n))
     aux = aux_inputs(angle_between(w, sun), g1, g2, share, 1.0, tau)
     return Furnace(stencil, aux, (p * np.exp(-tau)).astype(np.float32), (1 / (0.5 + 0.5 * p)).astype(np.float32))

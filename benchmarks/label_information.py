@@ -77,7 +77,7 @@ class Labels:
         p, w, sun = self.points[rows], self.w[rows], self.sun[rows]
         t, n = self.field.types, len(rows)
         o, d = (t.Array3f(np.ascontiguousarray(v.T)) for v in (p, sun))
-        tau = optical_depth(self.field, o, d, t.Float(0), t.Float(1e30), t.Float(0.5), t.Bool(np.ones(n, bool)))
+        tau = optical_depth(self.field, o, d, t.Float(0), t.Float(1e30), t.Bool(np.ones(n, bool)))
         stencil = self.descriptor.stencils_numpy(p, w, sun, rng.uniform(0, 2 * np.pi, n))
         return stencil, aux_inputs(angle_between(w, sun), self.g[rows], 0.0, 1.0, self.albedo[rows], np.array(tau))
 

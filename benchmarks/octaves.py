@@ -140,18 +140,17 @@ class OctaveRenderer:
         """What the cloud sends back along rays, one Float a colour channel, and what it lets pass."""
         types, cloud = self._types, self._cloud
         n, channels = dr.width(origin, direction, end), len(cloud.albedo)
-        jitter = numbers.number(stratified.MARCH)
-        tau = optical_depth(cloud.field, origin, direction, types.Float(0), end, jitter, types.Bool(True))
+        tau = optical_depth(cloud.field, origin, direction, types.Float(0), end, types.Bool(True))
         hidden = opacity_of(tau)
         through = dr.exp(-tau)
         colours = [dr.zeros(types.Float, n) for _ in range(channels)]
-        dr.eval(hidden, through, origin, direction, end, jitter)
+        dr.eval(hidden, through, origin, direction, end)
         lanes: Any = dr.compress(hidden > 0)
         if len(lanes) == 0 or not any(a > 0 for a in cloud.albedo):
             return colours, through
-        o, d, e, jitter, hidden = map(taker(types, lanes), (origin, direction, end, jitter, hidden))
+        o, d, e, hidden = map(taker(types, lanes), (origin, direction, end, hidden))
         own = numbers.take(lanes)
-        distance = depths(cloud.field, o, d, e, jitter, hidden, own.number(stratified.SHARE), _DEPTHS, types.Bool(True))
+        distance = depths(cloud.field, o, d, e, hidden, own.number(stratified.SHARE), _DEPTHS, types.Bool(True))
         dr.eval(distance)
         take = taker(types, dr.arange(types.UInt32, len(lanes) * _DEPTHS) // dr.opaque(types.UInt32, _DEPTHS))
         w = take(d)

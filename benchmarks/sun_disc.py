@@ -119,7 +119,7 @@ def by_network(view: View, disc: Sun, random: np.random.Generator) -> tuple[Halv
 
     def ask(omega: NDArray[np.float32]) -> NDArray[np.float64]:
         toward = types.Array3f(np.ascontiguousarray(omega.T))
-        tau = optical_depth(view.field, points, toward, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), _DEEP)
+        tau = optical_depth(view.field, points, toward, types.Float(0), types.Float(math.inf), types.Bool(True), _DEEP)
         return view.network(points, w, toward, view.phase, (1.0,), tau)[:, 0].astype(np.float64)
 
     n = len(view.points)

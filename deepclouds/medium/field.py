@@ -36,8 +36,10 @@ class Field:
         local bounds of the extinction, for tracking and for skipping what is empty.
     majorant
         the largest extinction, 1 / world length.
-    step
-        half of the smallest voxel edge, world units: the step of deterministic marches.
+    grid
+        the samples on the device.
+    samples, last
+        how many there are along x, y and z, and the largest index that a cell of interpolation begins at, on the device.
 
     Notes
     -----
@@ -52,12 +54,11 @@ class Field:
         self.volume = volume
         self.scale = float(scale)
         edges = np.linalg.norm(volume.to_world[:3, :3], axis=0)
-        self.step = 0.5 * float(volume.voxel_size.min())
-        self._grid: Grid
+        self.grid: Grid
         if isinstance(volume, SparseVolume):
             size = np.array(volume.resolution)
             self.majorants = Majorants(types, volume.bricks, edges / size, brick, self.scale)
-            self._grid = BrickGrid(types, volume.bricks, self.scale)
+            self.grid = BrickGrid(types, volume.bricks, self.scale)
             # A brick holds the sample after the last one too, which a single sample along an axis is never mixed with.
             self.majorant, last = float(self.majorants.bound.max()), np.maximum(size - 2, 0)
         else:
@@ -68,18 +69,18 @@ class Field:
             sigma = (grid.astype(np.float64) * scale).astype(np.float32)
             size = np.array(sigma.shape[::-1])
             self.majorants = Majorants(types, sigma, edges / size, brick)
-            self._grid = DenseGrid(types, sigma)
+            self.grid = DenseGrid(types, sigma)
             self.majorant, last = float(sigma.max()), size - 2
         inverse = np.linalg.inv(volume.to_world)
         self._to_unit = [[dr.opaque(types.Float, float(v)) for v in row] for row in inverse[:3]]
-        self._samples = [dr.opaque(types.Float, float(n)) for n in volume.resolution]
-        self._last = [dr.opaque(types.Float, float(n)) for n in last]
+        self.samples = [dr.opaque(types.Float, float(n)) for n in volume.resolution]
+        self.last = [dr.opaque(types.Float, float(n)) for n in last]
 
     @property
     def nbytes(self) -> int:
         """Bytes of the volume, of the samples on the device, and of the majorants."""
         volume = self.volume.bricks.nbytes if isinstance(self.volume, SparseVolume) else self.volume.density.nbytes
-        return volume + self._grid.nbytes + self.majorants.nbytes
+        return volume + self.grid.nbytes + self.majorants.nbytes
 
     def to_unit(self, p: Any) -> Any:
         """World points to coordinates in the unit cube of the grid's box."""
@@ -103,7 +104,7 @@ class Field:
         """Extinction at points given in the unit cube of the box."""
         inside = active & self.holds_unit(unit)
         low, frac = self._cells(unit)
-        return trilinear(self._grid, [self.types.UInt32(index) for index in low], frac, inside)
+        return trilinear(self.grid, [self.types.UInt32(index) for index in low], frac, inside)
 
     def drawn_unit(self, unit: Any, numbers: list[Any], active: Any = True) -> Any:
         """One of the eight samples around points of the unit cube, drawn by the weights that interpolation gives them.
@@ -123,12 +124,12 @@ class Field:
         low, frac = self._cells(unit)
         one = self.types.UInt32(1)
         chosen = [self.types.UInt32(index) + dr.select(u < f, one, 0) for index, f, u in zip(low, frac, numbers, strict=True)]
-        return dr.gather(self.types.Float, self._grid.data, self._grid.place(chosen, active), active)
+        return dr.gather(self.types.Float, self.grid.data, self.grid.place(chosen, active), active)
 
     def _cells(self, unit: Any) -> tuple[list[Any], list[Any]]:
         """The sample before each point, x first, as a float, and how far the point lies from it toward the next, 0 to 1."""
         low, frac = [], []
-        for value, n, last in zip(unit, self._samples, self._last, strict=True):
+        for value, n, last in zip(unit, self.samples, self.last, strict=True):
             cell = dr.clip(dr.fma(value, n, -0.5), 0.0, n - 1)
             index = dr.minimum(dr.floor(cell), last)
             low.append(index)

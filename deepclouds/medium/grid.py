@@ -106,11 +106,18 @@ Grid = DenseGrid | BrickGrid
 
 def trilinear(grid: Grid, low: list[Any], frac: list[Any], active: Any = True) -> Any:
     """Interpolate between the eight samples from indices `low` on, x first, at `frac` in [0, 1]; 0 for inactive lanes."""
-    t, base, rows = grid.types, grid.place(low, active), []
-    for offset in grid.corners:
-        a = dr.gather(t.Float, grid.data, base + offset, active)
-        b = dr.gather(t.Float, grid.data, base + (offset + 1), active)
-        rows.append(dr.fma(frac[0], b - a, a))
+    return mixed(corners(grid, low, active), frac)
+
+
+def corners(grid: Grid, low: list[Any], active: Any = True) -> list[Any]:
+    """The eight samples from indices `low` on, x first, in pairs along x; 0 for inactive lanes."""
+    base = grid.place(low, active)
+    return [dr.gather(grid.types.Float, grid.data, base + (offset + step), active) for offset in grid.corners for step in (0, 1)]
+
+
+def mixed(samples: list[Any], frac: list[Any]) -> Any:
+    """Interpolate between the samples of `corners` at `frac` in [0, 1], x first."""
+    rows = [dr.fma(frac[0], b - a, a) for a, b in zip(samples[::2], samples[1::2], strict=True)]
     front = dr.fma(frac[1], rows[1] - rows[0], rows[0])
     back = dr.fma(frac[1], rows[3] - rows[2], rows[2])
     return dr.fma(frac[2], back - front, front)

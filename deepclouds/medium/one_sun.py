@@ -8,9 +8,13 @@ heuristic):
     4 pi p(w_i . w) p(w . omega_sun) / (p(w_i . w) + p(w . omega_sun))
 
 for the branch and for the walk alike, which is never above the smaller of both lobes.
+
+Light from all around needs no connection: what a walk sees where it leaves the cloud is such light.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -25,6 +29,25 @@ from deepclouds.medium.phase import as_lobes, rotate_to
 _WALK, _SHADOW, _BRANCH, _BRANCH_SHADOW = range(4)
 
 
+class Escapes:
+    """Where `count` walks leave the cloud, all on the device.
+
+    Attributes
+    ----------
+    position
+        (n,) points in the unit cube of the box: of the last collision.
+    direction
+        (n,) unit vectors in which they leave it.
+    weight
+        one Float for each albedo: radiance that comes from there, times the weight and the albedo of the walk's first point, is J; 0 of
+        walks that did not collide again, and of those that were ended.
+    """
+
+    def __init__(self, types: Any, count: int, albedos: int) -> None:
+        self.position, self.direction = dr.zeros(types.Array3f, count), dr.zeros(types.Array3f, count)
+        self.weight = [dr.zeros(types.Float, count) for _ in range(albedos)]
+
+
 def trace_one_sun(
     field: Field,
     points: NDArray[np.float32],
@@ -36,7 +59,6 @@ def trace_one_sun(
     seed: int,
     lanes: int = 4096,
     connect: float = 1.0,
-    varying: AlbedoField | None = None,
     roulette: bool = False,
 ) -> NDArray[np.float32]:
     """Unbiased estimates of ``4 pi J / (albedo^2 E)``, one for every walk: `trace_walks` for one sun, with less noise.
@@ -49,9 +71,6 @@ def trace_one_sun(
         (n, 3) unit vectors TOWARD the sun.
     connect
         vertices and branches are followed up with probability ``min(1, connect * value)``, weighted by its inverse.
-    varying
-        albedo at the collisions, in place of `albedos`: then the estimates are those of ``4 pi J / (albedo(x) E)``, the albedo at the
-        point itself taken out alone, and m is the number of its channels.
 
     Returns
     -------
@@ -61,26 +80,81 @@ def trace_one_sun(
     -----
     A point outside of the box sends no side branch: there the walk's own collision counts in full.
     """
-    if varying is not None:
-        albedos = np.ones((len(points), varying.channels), np.float32)
     n, m_albedos = len(points), albedos.shape[1]
     total = n * walks
     if total == 0 or field.majorant == 0.0:
         return np.zeros((n, walks, m_albedos), np.float32)
     if total * m_albedos >= 2**31:
         raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
-    types = field.types
-    queries = _Queries(types, points, directions, as_lobes(phase), suns[:, None], albedos)
-    roulette = roulette and bool(varying is not None or np.any(albedos < 1))
-    job = _Job(types, walks, total, m_albedos, seed, lanes, connect, roulette)
-    _loop(field, queries, job, varying)
+    job = _Job(field.types, walks, total, m_albedos, seed, lanes, connect, roulette and bool(np.any(albedos < 1)))
+    _loop(field, _Queries(field.types, points, directions, as_lobes(phase), suns[:, None], albedos), job, _Kind())
     return np.array(job.result).reshape(n, walks, m_albedos)
 
 
+def trace_to_escape(
+    field: Field,
+    points: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    phase: NDArray[np.float32],
+    suns: NDArray[np.float32] | None,
+    albedos: NDArray[np.float32],
+    seed: int,
+    lanes: int = 4096,
+    varying: AlbedoField | None = None,
+    watched: bool = True,
+) -> tuple[NDArray[np.float32], Escapes]:
+    """Walks, one a point, under one sun or none, and where they leave the cloud: there each sees light from all around.
+
+    Parameters
+    ----------
+    field, points, directions, phase, albedos, seed, lanes
+        as for `trace_one_sun`; the walks that have lost most of their weight are thinned out.
+    suns
+        (n, 3) unit vectors TOWARD the sun, or None for no sun.
+    varying
+        albedo at the collisions, in place of `albedos`: then the estimates are those of ``4 pi J / (albedo(x) E)``, the albedo at the
+        point itself taken out alone, and m is the number of its channels.
+    watched
+        whether anybody asks for the escapes; those that nobody asks for all have weight 0.
+
+    Returns
+    -------
+    float32 array (n, m) as of `trace_one_sun`, of zeros without a sun; and the escapes.
+    """
+    if varying is not None:
+        albedos = np.ones((len(points), varying.channels), np.float32)
+    n, m_albedos = len(points), albedos.shape[1]
+    types = field.types
+    if n == 0 or field.majorant == 0.0:
+        return np.zeros((n, m_albedos), np.float32), Escapes(types, n, m_albedos)
+    if n * m_albedos >= 2**31:
+        raise ValueError(f"{n} walks at once need more than 2^31 results: trace fewer points a call")
+    toward = np.broadcast_to(np.float32([0, 0, 1]), (n, 3)) if suns is None else suns
+    job = _Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
+    escapes = Escapes(types, n, m_albedos)
+    dr.make_opaque(escapes.position, escapes.direction, escapes.weight)
+    kind = _Kind(varying, suns is not None, escapes if watched else None)
+    _loop(field, _Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
+    return np.array(job.result).reshape(n, m_albedos), escapes
+
+
+class _Kind:
+    """What a kernel of walks does: see the functions above. Not a dataclass, of which Dr.Jit would make variables of the loop."""
+
+    def __init__(
+        self,
+        varying: AlbedoField | None = None,
+        sunlit: bool = True,
+        escapes: Escapes | None = None,
+    ) -> None:
+        self.varying, self.sunlit, self.escapes = varying, sunlit, escapes
+
+
 @dr.syntax
-def _loop(field: Field, queries: _Queries, job: _Job, varying: AlbedoField | None) -> None:
+def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     types = field.types
     result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
+    varying, escapes = kind.varying, kind.escapes
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     m_albedos = len(queries.albedos)
     walks_each = dr.opaque(UInt32, job.walks)
@@ -109,6 +183,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, varying: AlbedoField | Non
     # Albedo where a branch has landed, if it varies; else the weight has it already.
     of_branch_end = [dr.full(Float, 1, lanes) for _ in range(m_albedos if varying is not None else 0)]
 
+    scattered = dr.full(Bool, False, lanes)  # has collided since its first point
+    left = dr.full(Bool, False, lanes)  # has left the cloud after that
+
     clock = dr.zeros(UInt32, lanes)
 
     while alive:
@@ -117,6 +194,13 @@ def _loop(field: Field, queries: _Queries, job: _Job, varying: AlbedoField | Non
             for m in range(m_albedos):
                 dr.scatter(result, found[m], number * m_albedos + m, number < limit)
                 found[m] = Float(0)
+            if escapes is not None:
+                for c in range(3):
+                    dr.scatter(escapes.position[c], position[c], number, left)
+                    dr.scatter(escapes.direction[c], direction[c], number, left)
+                for m in range(m_albedos):
+                    dr.scatter(escapes.weight[m], weight[m], number, left)
+            scattered, left = Bool(False), Bool(False)
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
             point = number // walks_each
@@ -162,42 +246,44 @@ def _loop(field: Field, queries: _Queries, job: _Job, varying: AlbedoField | Non
         gone = traced & ~inside
         over = hit | gone
 
-        lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
-        for m in range(m_albedos):
-            arriving = value * weight[m]
-            if varying is not None:
-                arriving *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
-            found[m] += dr.select(lit, arriving, 0)
-
-        collision = hit & walking
+        collision, landed = hit & walking, hit & (task == _BRANCH)
+        scattered |= collision
         if varying is not None:
             # The weight of a vertex has its own albedo already when it is connected.
             here = varying.at_unit(unit, hit)
             for m in range(m_albedos):
                 weight[m] = dr.select(collision, weight[m] * here[m], weight[m])
-                of_branch_end[m] = dr.select(hit & (task == _BRANCH), here[m], of_branch_end[m])
+                of_branch_end[m] = dr.select(landed, here[m], of_branch_end[m])
         position = dr.select(collision, unit, position)
-        toward_sun = _phase(lobes, dr.dot(direction, sun))
-        of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
-        # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connection.
-        shadow = collision & (u_event * majorant < sigma * (often * of_vertex))
-
-        # Once a vertex is dealt with, light of the next order may come by a side branch.
-        leaving = begun | (collision & ~shadow) | (over & (task == _SHADOW))
+        leaving = begun | collision
+        branch, shadow, of_vertex = Bool(False), Bool(False), Float(0)
+        if kind.sunlit:
+            toward_sun = _phase(lobes, dr.dot(direction, sun))
+            of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
+            lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
+            for m in range(m_albedos):
+                arriving = value * weight[m]
+                if varying is not None:
+                    arriving *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
+                found[m] += dr.select(lit, arriving, 0)
+            # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connection.
+            shadow = collision & (u_event * majorant < sigma * (often * of_vertex))
+            leaving = begun | (collision & ~shadow) | (over & (task == _SHADOW))
         if varying is None:
             for m in range(m_albedos):
                 weight[m] = dr.select(leaving & ~begun, weight[m] * albedo[m], weight[m])
-        rng, u_cosine = _uniform(types, rng)
-        rng, u_azimuth = _uniform(types, rng)
-        rng, u_branch = _uniform(types, rng)
-        around = rotate_to(sun, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
-        of_walk, of_sun = _phase(lobes, dr.dot(direction, around)), _phase(lobes, dr.dot(around, sun))
-        of_branch = 4 * np.pi * of_walk * of_sun * dr.rcp(of_walk + of_sun)
-        branch = leaving & (u_branch < often * of_branch)
-        side = dr.select(branch, around, side)
-        landed = hit & (task == _BRANCH)
-        landing = dr.select(landed, unit, landing)
-        value = dr.select(shadow, dr.maximum(of_vertex, least), dr.select(branch, dr.maximum(of_branch, least), value))
+        if kind.sunlit:
+            # Once a vertex is dealt with, light of the next order may come by a side branch.
+            rng, u_cosine = _uniform(types, rng)
+            rng, u_azimuth = _uniform(types, rng)
+            rng, u_branch = _uniform(types, rng)
+            around = rotate_to(sun, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
+            of_walk, of_sun = _phase(lobes, dr.dot(direction, around)), _phase(lobes, dr.dot(around, sun))
+            of_branch = 4 * np.pi * of_walk * of_sun * dr.rcp(of_walk + of_sun)
+            branch = leaving & (u_branch < often * of_branch)
+            side = dr.select(branch, around, side)
+            landing = dr.select(landed, unit, landing)
+            value = dr.select(shadow, dr.maximum(of_vertex, least), dr.select(branch, dr.maximum(of_branch, least), value))
 
         turn = (leaving & ~branch) | (gone & (task == _BRANCH)) | (over & (task == _BRANCH_SHADOW))
         rng, u_cosine = _uniform(types, rng)
@@ -206,6 +292,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, varying: AlbedoField | Non
         direction = dr.select(turn, rotate_to(direction, cosine, 2 * np.pi * u_azimuth), direction)
         density = dr.select(turn, _phase(lobes, cosine), density)
         rival = dr.select(turn, 1, rival)
+        left |= gone & walking & scattered
         ended |= gone & walking
         if job.roulette:
             rng, lost, weight = _thinned(types, rng, weight, turn & ~begun)

@@ -116,7 +116,7 @@ class AllRound:
         random = np.random.default_rng([seed & 0xFFFFFFFF, 0x7420])
         place = (np.arange(count) + random.random()) / count * total[-1]
         drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
-        found = walks.walked(points[drawn], along[drawn], int(random.integers(1 << 32)), random)
+        found = walks.walked(points[drawn], along[drawn], random)
         each = (weights[drawn] * (total[-1] / wanted[drawn]))[:, None]
         below = np.maximum((each * predicted[drawn]).mean(axis=0), 1e-30)
         residual = each * (found - predicted[drawn]) / below

@@ -16,7 +16,18 @@ from deepclouds_runtime import stratified
 from deepclouds_runtime.frame_source import FrameSource
 from deepclouds_runtime.march import depths, gathered
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.transport import Cloud, CloudLight, Counts, Lights, opacity_of, scatter, scatter_on, single_scattering, taker
+from deepclouds_runtime.transport import (
+    Cloud,
+    CloudLight,
+    Counts,
+    Lights,
+    opacity_of,
+    scatter,
+    scatter_on,
+    scatter_paths,
+    single_scattering,
+    taker,
+)
 
 
 def fast_cloud_light(
@@ -51,7 +62,8 @@ def fast_cloud_light(
     count
         collisions a ray.
     sampled
-        whether the multiple scattering of the cloud's own `scattering`, past its `exact` orders, is sampled at one of these collisions.
+        whether the multiple scattering of the cloud's own `scattering`, past its `exact` orders, or of its `paths` is sampled at one of
+        these collisions.
     """
     types, medium = cloud.field.types, cloud.field
     n, channels = dr.width(origin, direction, end), len(cloud.albedo)
@@ -66,14 +78,13 @@ def fast_cloud_light(
         return result
     o, d, e = map(taker(types, lanes), (origin, direction, end))
     own = numbers.take(lanes)
-    jitter = own.number(stratified.MARCH)
     octrees = [source.octree for source in sources]
-    tau, sums = gathered(medium, octrees, o, d, e, jitter, own.number(stratified.PLACE), types.Bool(True))
+    tau, sums = gathered(medium, octrees, o, d, e, own.number(stratified.PLACE), types.Bool(True))
     hidden = opacity_of(tau)
     indirect = [dr.zeros(types.Float, len(lanes)) for _ in range(channels)]
     for source, values in zip(sources, sums, strict=True):
         indirect = [a + b for a, b in zip(indirect, source.colours(values), strict=True)]
-    dr.eval(hidden, tau, indirect, o, d, e, jitter)
+    dr.eval(hidden, tau, indirect, o, d, e)
     dr.scatter(result.opacity, hidden, lanes)
     dr.scatter(result.transmittance, dr.exp(-tau), lanes)
     for c in range(channels):
@@ -83,9 +94,9 @@ def fast_cloud_light(
     if len(filled) == 0:
         return result
     lanes = dr.gather(types.UInt32, lanes, filled)
-    o, d, e, jitter, hidden = map(taker(types, filled), (o, d, e, jitter, hidden))
+    o, d, e, hidden = map(taker(types, filled), (o, d, e, hidden))
     own = own.take(filled)
-    distance = depths(medium, o, d, e, jitter, hidden, own.number(stratified.SHARE), count, types.Bool(True))
+    distance = depths(medium, o, d, e, hidden, own.number(stratified.SHARE), count, types.Bool(True))
     dr.eval(distance)
     dr.scatter(result.distance, dr.block_sum(distance, count) * (1 / count), lanes)
     if any(a > 0 for a in cloud.albedo):
@@ -97,7 +108,7 @@ def fast_cloud_light(
         dr.eval(single)
         for c in range(channels):
             dr.scatter(result.direct[c], dr.block_sum(single[c], count) * hidden * (1 / count), lanes)
-        if sampled and cloud.scattering is not None:
+        if sampled and (cloud.scattering is not None or cloud.paths is not None):
             n = len(filled)
             many = dr.opaque(types.UInt32, count)
             slot = dr.minimum(types.UInt32(own.number(stratified.PLACE) * types.Float(many)), many - 1)
@@ -106,7 +117,7 @@ def fast_cloud_light(
             # Its single scattering is there already: all that is kept of it is what was scattered again.
             again = CloudLight(hidden, hidden, hidden)
             again.direct, again.indirect = ([dr.zeros(types.Float, n) for _ in range(channels)] for _ in range(2))
-            go_on = scatter_on if cloud.exact > 1 else scatter
+            go_on = scatter_paths if cloud.paths is not None else scatter_on if cloud.exact > 1 else scatter
             go_on(cloud, lights, place, d, hidden, types.Float(1), own, counts, dr.arange(types.UInt32, n), again)
             for c in range(channels):
                 dr.scatter_add(result.indirect[c], again.indirect[c], lanes)

@@ -144,7 +144,7 @@ class Seen:
 def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, count: int) -> Seen:
     """Collisions along rays, `count` a ray, one in each equal share of what the cloud hides."""
     types = field.types
-    tau = optical_depth(field, origin, direction, types.Float(0), end, types.Float(0.5), types.Bool(True))
+    tau = optical_depth(field, origin, direction, types.Float(0), end, types.Bool(True))
     hidden = opacity_of(tau)
     dr.eval(hidden, origin, direction, end)
     lanes: Any = dr.compress(hidden > 0)
@@ -152,7 +152,7 @@ def seen_by(field: Field, origin: Any, direction: Any, end: Any, shift: Any, cou
     if n == 0:
         return Seen(np.empty((0, 3)), np.empty(0), np.empty(0, np.int64))
     origin, direction, end, hidden, shift = map(taker(types, lanes), (origin, direction, end, hidden, shift))
-    distance = depths(field, origin, direction, end, types.Float(0.5), hidden, shift, count, types.Bool(True))
+    distance = depths(field, origin, direction, end, hidden, shift, count, types.Bool(True))
     lane = dr.arange(types.UInt32, n * count) // dr.opaque(types.UInt32, count)
     take = taker(types, lane)
     points = dr.fma(take(direction), distance, take(origin))
@@ -333,7 +333,7 @@ class _Predicted:
         x = upload(types, np.tile(points, (len(pairs), 1)))
         d = upload(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
         omega = upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
-        tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), _DEEP)
+        tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Bool(True), _DEEP)
         dr.eval(tau)
         query = x, d, omega, self._cloud.phase, self._albedos, tau
         j, errors = self._network.with_errors(*query) if self.carried else (self._network(*query), None)

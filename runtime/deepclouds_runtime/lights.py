@@ -208,6 +208,20 @@ class Environment:
         seen = self._shade.visible(points, self.types.Array3f(*(dr.opaque(self.types.Float, v) for v in beam.omega)))
         return [dr.select(seen, dr.opaque(self.types.Float, v), 0) for v in beam.irradiance]
 
+    def bright_part(self, times: float) -> BrightPart | None:
+        """The directions that are so many times brighter than the mean of all around, or None where there are none."""
+        rows, columns = self._shape
+        edges = np.cos(np.linspace(0, np.pi, rows + 1))
+        power = luminance(self._colours) * (edges[:-1] - edges[1:])[:, None]
+        # The mean over the sphere, whose solid angle is that of two for the edges' cosines.
+        bright = luminance(self._colours) > times * power.sum() / (2 * columns)
+        if not bright.any():
+            return None
+        colours = np.where(bright[..., None], self._colours, 0)
+        alone = Environment(self.types, self.radiance, colours, self._frame, self._shade, uniform=0.0)
+        irradiance = (self._colours * bright[..., None] * (edges[:-1] - edges[1:])[:, None, None]).sum(axis=(0, 1)) * (2 * np.pi / columns)
+        return BrightPart(alone, self.types.Float(bright.astype(np.float32).ravel()), float(irradiance.max()))
+
     def lookup(self, table: Any, direction: Any) -> Any:
         """Values of `table`, one float a cell of the grid, row by row, in the cells that these directions fall into."""
         row, column = self._cell(direction)
@@ -234,6 +248,27 @@ class Environment:
     def _to_world(self, x: Any, y: Any, z: Any) -> Any:
         m = self._frame
         return dr.normalize(self.types.Array3f(*(x * float(r[0]) + y * float(r[1]) + z * float(r[2]) for r in m)))
+
+
+@dataclass(frozen=True)
+class BrightPart:
+    """A part of an environment, given by cells of its grid.
+
+    Attributes
+    ----------
+    light
+        that part alone, as a source of directions; it is black elsewhere, but `arriving` does not know that.
+    irradiance
+        of all of it, perpendicular to each direction, of the strongest colour channel.
+    """
+
+    light: Environment
+    _inside: Any
+    irradiance: float
+
+    def holds(self, direction: Any) -> Any:
+        """Whether directions belong to it."""
+        return self.light.lookup(self._inside, direction) > 0.5
 
 
 def _cumulative(weight: NDArray[np.float64]) -> NDArray[np.float32]:

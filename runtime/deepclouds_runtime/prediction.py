@@ -96,7 +96,7 @@ def predict(
 
     field = Field(types, volume, scale)
     p, d, s = upload(x), upload(w), upload(suns)
-    tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Float(0.5), types.Bool(True), float("inf"))
+    tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Bool(True), float("inf"))
     if predictor is None:
         name = None if model is None else fspath(model)
         predictor = _warned(name, (g, g2, lobe_weight), albedo, optical_size(volume, scale))

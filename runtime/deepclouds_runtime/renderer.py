@@ -20,10 +20,11 @@ from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import doubtful, warning
 from deepclouds_runtime.error_parts import error_parts
 from deepclouds_runtime.frame import ERROR, Frame
+from deepclouds_runtime.light_walks import Paths
 from deepclouds_runtime.lights import Shade, environment
 from deepclouds_runtime.result import COLOURS, RenderResult, Statistics
 from deepclouds_runtime.rounds import Watch, fixed_rounds, rounds_for_error, say_ignored
-from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped, WalkScattering
+from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.surfaces import Reflectors
 from deepclouds_runtime.transport import Cloud, Lights
@@ -249,15 +250,16 @@ class Renderer:
         watch = Watch(progress, partial, interrupted, estimate)
         scattering = None
         if scene.max_depth != 2:
-            scattering = WalkScattering(self._field, 1, seed, self._albedo) if self._walks else self._network
+            scattering = self._network
         adaptive = self.mode == "fast"
         # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
-        sampled = adaptive and scattering is not None and (self._walks or self._exact_orders > 1)
+        paths = Paths(self._field, scene.albedo, scene.phase, self._albedo, seed) if self._walks else None
+        sampled = adaptive and (paths is not None or (scattering is not None and self._exact_orders > 1))
         most = self.samples(spp) if spp is not None or not adaptive or (self._walks and not self.unbiased) else _MOST_AUTOMATIC
         if spp is None and self.unbiased:
             most = _MOST_SAMPLES
         exact = 1 if self._walks else self._exact_orders
-        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo), self._lights()
+        cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo, paths), self._lights()
         camera = Camera(types, scene.sensor)
         quick = self._quicker if correct else None
         frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, sampled=sampled)

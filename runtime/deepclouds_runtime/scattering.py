@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from deepclouds.backend import rows
 from deepclouds.descriptor import LEVELS, POINTS, Descriptor
-from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds.medium.phase import ordered_lobes
@@ -155,12 +154,10 @@ class WalkScattering:
         walks a query.
     seed
         root of the random streams; every call continues with streams of its own.
-    varying
-        albedo that varies in space: calls then answer ``4 pi J / (albedo(x) E)`` of each of its channels, whatever `albedos` they give.
     """
 
-    def __init__(self, field: Field, walks: int = 1, seed: int = 0, varying: AlbedoField | None = None) -> None:
-        self._field, self._walks, self._varying = field, walks, varying
+    def __init__(self, field: Field, walks: int = 1, seed: int = 0) -> None:
+        self._field, self._walks = field, walks
         self._streams = np.random.SeedSequence(seed)
 
     def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
@@ -177,7 +174,6 @@ class WalkScattering:
             np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos))),
             self._walks,
             seed,
-            varying=self._varying,
             roulette=True,
         )
         mean: NDArray[np.float32] = values.mean(axis=1)

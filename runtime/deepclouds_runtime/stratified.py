@@ -11,12 +11,11 @@ import numpy as np
 # the first two are the powers of the plastic number instead, the best spread for pairs.
 _STEPS = tuple(
     round(float(value % 1.0) * 2**32)
-    for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43]))
+    for value in (0.7548776662466927, 0.5698402909980532, *np.sqrt([3, 5, 7, 11, 13, 17, 19, 29, 31, 37, 41, 43]))
 )
 (
     PIXEL_X,
     PIXEL_Y,
-    MARCH,
     LIGHT_U,
     LIGHT_V,
     PHASE_U,
@@ -24,7 +23,6 @@ _STEPS = tuple(
     SURFACE_U,
     SURFACE_V,
     SURFACE_W,
-    SHADOW,
     ROULETTE,
     PLACE,
     SHARE,

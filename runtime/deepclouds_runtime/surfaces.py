@@ -46,12 +46,11 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
     bsdf = interaction.bsdf()
     valid = interaction.is_valid()
     total = [dr.zeros(types.Float, dr.width(interaction.p)) for _ in cloud.albedo]
-    jitter = numbers.number(stratified.SHADOW)
 
     def through(omega: Any) -> tuple[Any, Any]:
         """Share of the light from direction `omega` that the cloud lets pass, and where the ray starts."""
         origin = plain(types, interaction.spawn_ray(mi.Vector3f(omega)).o)
-        tau = optical_depth(cloud.field, origin, omega, types.Float(0), types.Float(math.inf), jitter, plain(types, valid))
+        tau = optical_depth(cloud.field, origin, omega, types.Float(0), types.Float(math.inf), plain(types, valid))
         return dr.exp(-tau), origin
 
     def facing(omega: Any) -> list[Any]:

@@ -2,7 +2,7 @@
 
     L = int T sigma_t (S1 + J) dt,   estimated by   (1 - exp(-tau)) (S1 + J)   at one point drawn from T sigma_t
 
-The optical depth and the point are found by a deterministic march, so all noise left is that of the point's position and of the
+The optical depth and the point are found without random numbers, so all noise left is that of the point's position and of the
 directions drawn from environments.
 """
 
@@ -15,6 +15,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of
 from deepclouds.medium.albedo import AlbedoField
@@ -65,7 +67,9 @@ class Cloud:
         orders of scattering that are sampled before `scattering` is asked: with 1 it is asked at the first collision of a ray, with 2 at
         the second one, and so on.
     varying
-        the albedo, where it varies in space. `scattering` then gives J over the albedo at the point, see `WalkScattering`.
+        the albedo, where it varies in space; then there is no `scattering`.
+    paths
+        in place of `scattering`, all of J by path tracing: lights, points and directions (Array3f) -> (n, channels).
     """
 
     field: Field
@@ -75,6 +79,7 @@ class Cloud:
     known: Callable[[Any, Any], list[Any]] | None = None
     exact: int = 1
     varying: AlbedoField | None = None
+    paths: Callable[[Lights, Any, Any], NDArray[np.float64]] | None = None
 
     def albedo_at(self, points: Any) -> list[Any]:
         """Albedo of each channel at world points (Array3f)."""
@@ -147,11 +152,10 @@ def cloud_light(
     types, medium = cloud.field.types, cloud.field
     weight = types.Float(1) if weight is None else weight
     n = dr.width(origin, direction, end)
-    jitter = numbers.number(stratified.MARCH)
-    tau = optical_depth(medium, origin, direction, types.Float(0), end, jitter, weight > 0)
+    tau = optical_depth(medium, origin, direction, types.Float(0), end, weight > 0)
     opacity = opacity_of(tau)
     target = depth_of(numbers.number(stratified.DEPTH) * opacity)
-    distance, _ = distance_at(medium, origin, direction, types.Float(0), end, jitter, target, tau > 0)
+    distance = distance_at(medium, origin, direction, types.Float(0), end, target, tau > 0)
     result = CloudLight(opacity, dr.exp(-tau), distance)
     channel_count = len(cloud.albedo)
     result.direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
@@ -217,11 +221,10 @@ def scatter(
             dr.scatter(result.direct[c], value * opacity, lanes)
         scatter_on(cloud, lights, points, w, opacity, importance, numbers, counts, lanes, result)
         return
+    if cloud.paths is not None:
+        scatter_paths(cloud, lights, points, w, opacity, importance, numbers, counts, lanes, result)
     # Which samples are worth a query is the same for all lights: one that lies in a thin place is so for each of them.
-    keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
-    asked = numbers.number(stratified.ROULETTE) < keep
-    queries: Any = dr.compress(asked) if cloud.scattering is not None else types.UInt32()
-    weight = dr.gather(types.Float, opacity / keep, queries)
+    queries, weight = _worth_it(types, opacity, importance, numbers) if cloud.scattering is not None else (types.UInt32(), types.Float())
     take = taker(types, queries)
     target = dr.gather(types.UInt32, lanes, queries)
 
@@ -229,13 +232,12 @@ def scatter(
         if len(queries):
             assert cloud.scattering is not None
             different = tuple(sorted(set(cloud.albedo)))
-            columns = [different.index(a) for a in cloud.albedo] if cloud.varying is None else range(channel_count)
             counts.queries += len(queries) * len(different)
             counts.skipped += (len(lanes) - len(queries)) * len(different)
             j = cloud.scattering(take(points), take(w), take(omega), cloud.phase, different, take(tau))
-            for c, (column, albedo) in enumerate(zip(columns, cloud.albedo_at(take(points)), strict=True)):
-                own = albedo if cloud.varying is not None else albedo * albedo
-                value = lanes_of(types.Float, j[:, column]) * (own * (0.25 / dr.pi)) * weight * take(radiance[c])
+            for c, albedo in enumerate(cloud.albedo):
+                own = dr.opaque(types.Float, albedo * albedo * (0.25 / math.pi))
+                value = lanes_of(types.Float, j[:, different.index(albedo)]) * own * weight * take(radiance[c])
                 dr.scatter_add(result.indirect[c], value, target)
 
     direct = single_scattering(cloud, lights, points, w, numbers, None if cloud.scattering is None else predict)
@@ -244,6 +246,39 @@ def scatter(
             dr.scatter(total, value * opacity, lanes)
     for c in range(channel_count):
         dr.scatter(result.direct[c], direct[c] * opacity, lanes)
+
+
+def _worth_it(types: Any, opacity: Any, importance: Any, numbers: Stratified) -> tuple[Any, Any]:
+    """Samples that are worth a query or a walk (UInt32), and their opacities, larger for those left out."""
+    keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
+    chosen: Any = dr.compress(numbers.number(stratified.ROULETTE) < keep)
+    return chosen, dr.gather(types.Float, opacity / keep, chosen)
+
+
+def scatter_paths(
+    cloud: Cloud,
+    lights: Lights,
+    points: Any,
+    w: Any,
+    opacity: Any,
+    importance: Any,
+    numbers: Stratified,
+    counts: Counts,
+    lanes: Any,
+    result: CloudLight,
+) -> None:
+    """Add multiple scattering at points of the cloud to lanes of `result` by the cloud's `paths`; parameters are those of `scatter`."""
+    types = cloud.field.types
+    chosen, weight = _worth_it(types, opacity, importance, numbers)
+    counts.skipped += dr.width(points) - len(chosen)
+    if cloud.paths is None or len(chosen) == 0:
+        return
+    counts.queries += len(chosen)
+    take = taker(types, chosen)
+    j = cloud.paths(lights, take(points), take(w))
+    target = dr.gather(types.UInt32, lanes, chosen)
+    for c in range(len(cloud.albedo)):
+        dr.scatter_add(result.indirect[c], lanes_of(types.Float, j[:, c]) * weight, target)
 
 
 def scatter_on(
@@ -266,8 +301,7 @@ def scatter_on(
     """
     types = cloud.field.types
     # As for queries: what adds little is followed seldom.
-    keep = dr.minimum(opacity * importance * (1 / _ROULETTE), 1)
-    follow: Any = dr.compress(numbers.number(stratified.ROULETTE) < keep)
+    follow, weight = _worth_it(types, opacity, importance, numbers)
     counts.skipped += dr.width(points) - len(follow)
     if len(follow) == 0:
         return
@@ -275,7 +309,7 @@ def scatter_on(
     numbers = numbers.take(follow)
     cosine = sample_two_lobe_cosine(numbers.number(stratified.PHASE_U), *(dr.opaque(types.Float, v) for v in cloud.phase))
     omega = rotate_to(take(w), cosine, 2 * dr.pi * numbers.number(stratified.PHASE_V))
-    origin, weight = take(points), take(opacity / keep)
+    origin = take(points)
     dr.eval(origin, omega, weight)
     end = dr.full(types.Float, math.inf, len(follow))
     if lights.shade.surfaces is not None:
@@ -317,13 +351,12 @@ def single_scattering(
     albedo = cloud.albedo_at(points)
     lobes = [dr.opaque(types.Float, v) for v in cloud.phase]
     direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
-    jitter = numbers.number(stratified.SHADOW)
     # A network is told the whole depth.
     deepest = _DEEP if each is not None else TAU_OPAQUE
 
     def light(omega: Any, radiance: list[Any], share: Any) -> None:
         """One direction: `radiance` is what arrives over the density of the direction."""
-        tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True), deepest)
+        tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), types.Bool(True), deepest)
         single = two_lobe(dr.dot(w, omega), *lobes) * dr.exp(-tau) * share
         for c in range(channel_count):
             direct[c] += albedo[c] * radiance[c] * single
@@ -351,7 +384,7 @@ def single_scattering(
             cosine = sample_two_lobe_cosine(numbers_of(stratified.PHASE_U), *lobes)
             omega = rotate_to(w, cosine, 2 * dr.pi * numbers_of(stratified.PHASE_V))
             drawn = two_lobe(cosine, *lobes)
-            tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), jitter, types.Bool(True))
+            tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), types.Bool(True))
             share = drawn / (drawn + source.density(omega)) * (1.0 / directions) * dr.exp(-tau)
             for c, value in enumerate(source.arriving(points, omega, numbers)):
                 direct[c] += albedo[c] * value * share

@@ -72,7 +72,7 @@ def kernel_stencils(types: ModuleType, vectors: Vectors) -> NDArray[np.float32]:
 
 
 def kernel_aux(types: ModuleType, vectors: Vectors) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The input `aux` (n, 6) as the renderer makes it from the stored tau, and tau (n,) by the renderer's own march."""
+    """The input `aux` (n, 6) as the renderer makes it from the stored tau, and tau (n,) by the renderer's own sum over cells."""
     import drjit as dr
 
     from deepclouds.medium.field import Field
@@ -90,7 +90,7 @@ def kernel_aux(types: ModuleType, vectors: Vectors) -> tuple[NDArray[np.float32]
         part = _rows(vectors, medium)
         field, zero = Field(types, vectors.volume, medium.scale), types.Float(0)
         points, toward = upload(part[:, 0:3]), upload(part[:, 6:9])
-        tau = optical_depth(field, points, toward, zero, types.Float(math.inf), types.Float(0.5), types.Bool(True), math.inf)
+        tau = optical_depth(field, points, toward, zero, types.Float(math.inf), types.Bool(True), math.inf)
         depths.append(np.array(tau))
     return aux_inputs(gamma, *(rows[:, c] for c in range(9, 14))), np.concatenate(depths)
 

@@ -15,12 +15,12 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 
-def unattenuated(field: Field, points: ArrayLike, directions: ArrayLike, jitter: float = 0.5) -> Floats:
+def unattenuated(field: Field, points: ArrayLike, directions: ArrayLike) -> Floats:
     """Transmittance from points (n, 3) along unit vectors (n, 3) to infinity, (n,)."""
     t = field.types
     o, d = (t.Array3f(*(t.Float(np.ascontiguousarray(np.asarray(v)[:, c], np.float32)) for c in range(3))) for v in (points, directions))
     active = t.Bool(np.ones(len(np.asarray(points)), bool))
-    return np.exp(-np.array(optical_depth(field, o, d, t.Float(0), t.Float(1e4), t.Float(jitter), active), np.float64))
+    return np.exp(-np.array(optical_depth(field, o, d, t.Float(0), t.Float(1e4), active), np.float64))
 
 
 def radiance(field: Field, origins: Singles, w: Singles, phase: ArrayLike, suns: ArrayLike, albedos: ArrayLike, seed: int) -> Floats:

@@ -53,7 +53,7 @@ def test_lookups_and_marches(any_backend: ModuleType, volume: Volume) -> None:
     points, w = inside(volume, 4000, 81), sphere(4000, 82)
     o, d = (t.Array3f(*(t.Float(np.ascontiguousarray(a[:, c])) for c in range(3))) for a in (points, w))
     np.testing.assert_allclose(np.array(field.sigma_t(o)), 12 * volume.sample(points.astype(np.float64)), atol=1e-3)
-    tau = optical_depth(field, o, d, t.Float(0), t.Float(np.inf), t.Float(0.5), t.Bool(True))
+    tau = optical_depth(field, o, d, t.Float(0), t.Float(np.inf), t.Bool(True))
     distance = (np.arange(1600) + 0.5) * 1.25e-3
     along = points[:400, None].astype(np.float64) + distance[:, None] * w[:400, None]
     quadrature = 12 * volume.sample(along.reshape(-1, 3)).reshape(400, -1).sum(axis=1) * 1.25e-3

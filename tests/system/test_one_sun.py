@@ -14,7 +14,7 @@ from scipy import ndimage
 from deepclouds.backend import backend
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
-from deepclouds.medium.one_sun import trace_one_sun
+from deepclouds.medium.one_sun import trace_one_sun, trace_to_escape
 from deepclouds.medium.phase import as_lobes
 from deepclouds.volume import Volume
 
@@ -116,3 +116,34 @@ def test_nothing_comes_out_of_nothing() -> None:
     assert trace_one_sun(_field(), points[:0], _sphere(3, 1)[:0], g[:0], _sphere(3, 2)[:0], white[:0], 5, 0).shape == (0, 5, 2)
     with pytest.raises(ValueError, match="2\\^31"):
         trace_one_sun(_field(), points, _sphere(3, 1), g, _sphere(3, 2), white, 1 << 30, 0)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.85])
+@pytest.mark.parametrize("margin", [0.0, 0.4], ids=["inside", "around the box"])
+def test_walks_that_leave_see_light_from_all_around(phase: Phase, margin: float) -> None:
+    """Radiance 1 + d . a in the direction d: what escapes see is what suns in every direction bring."""
+    field, n, each = _field(), 300, 1500
+    points, w = np.repeat(_points(field, n, margin), each, axis=0), np.repeat(_sphere(n, 34), each, axis=0)
+    lobes = np.broadcast_to(as_lobes(np.array([phase])), (len(points), 3))
+    albedos = np.broadcast_to(np.array(ALBEDOS, np.float32), (len(points), len(ALBEDOS)))
+    towards = np.array([0.6, -0.5, 0.4])
+    for suns in (None, np.broadcast_to(_sphere(1, 38), points.shape)):
+        _, escapes = trace_to_escape(field, points, w, lobes, suns, albedos, 44)
+        direction = np.stack([np.array(v) for v in escapes.direction], axis=1).astype(np.float64)
+        weight = np.stack([np.array(v) for v in escapes.weight], axis=1).astype(np.float64)
+        assert np.all(weight[:, 0] == 0)
+        np.testing.assert_allclose(np.linalg.norm(direction[weight[:, 2] > 0], axis=1), 1, atol=1e-4)
+        seen = (1 + direction @ towards)[:, None] * weight
+        around = _sphere(len(points), 45)
+        j = trace_one_sun(field, points, w, lobes, around, albedos, 1, 46)[:, 0].astype(np.float64)
+        by_suns = (1 + around.astype(np.float64) @ towards)[:, None] * j * np.array(ALBEDOS)
+        a, b = (v.reshape(n, each, -1) for v in (seen, by_suns))
+        error = np.sqrt(((a.var(axis=1) + b.var(axis=1)) / each).sum(axis=0)) / n
+        difference = np.abs(a.mean(axis=(0, 1)) - b.mean(axis=(0, 1)))
+        assert np.all(difference <= 3.5 * error)
+        assert np.all(error[1:] < 0.02 * b.mean(axis=(0, 1))[1:])
+        assert np.all(a.var(axis=1).mean(axis=0)[1:] < 0.7 * b.var(axis=1).mean(axis=0)[1:])
+    # White light through a white cloud: all that collides again.
+    position = np.stack([np.array(v) for v in escapes.position], axis=1)
+    assert position.min() >= 0
+    assert position.max() <= 1

@@ -162,7 +162,7 @@ def test_white_furnace(make: type, phase: Phase) -> None:
     toward = np.einsum("nc,ncd->nd", np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=1), frame)
     start = np.repeat(points, draws, axis=0)
     o, d = (t.Array3f(*(t.Float(np.ascontiguousarray(v[:, c], np.float32)) for c in range(3))) for v in (start, toward))
-    tau = optical_depth(field, o, d, t.Float(0), t.Float(1e4), t.Float(0.5), t.Bool(np.ones(n * draws, bool)))
+    tau = optical_depth(field, o, d, t.Float(0), t.Float(1e4), t.Bool(np.ones(n * draws, bool)))
     single = np.exp(-np.array(tau, np.float64)).reshape(n, draws)
 
     point_mean = multiple.mean(axis=1) + single.mean(axis=1)

@@ -159,16 +159,15 @@ def camera_rays(mi: Any, sensor: Any, size: int, spp: int, seed: int) -> tuple[S
 
 def tracker_image(field: Field, rays: tuple[Singles, Singles], g: float, albedo: float, sun: Singles, seed: int) -> Floats:
     """Radiance along the rays: at the first collision the sun's light attenuated (S1) and one walk for J."""
-    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(3)]
+    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2)]
     points, hit = first_collisions(field, *rays, seed=streams[0])
     points, w = points[hit], rays[1][hit]
     t, n = field.types, len(points)
     toward = t.Array3f(*(float(v) for v in sun))
-    jitter = t.Float(np.random.default_rng(streams[1]).random(n))
-    depth = optical_depth(field, device(points), toward, t.Float(0), t.Float(1e4), jitter, t.Bool(np.ones(n, bool)))
+    depth = optical_depth(field, device(points), toward, t.Float(0), t.Float(1e4), t.Bool(np.ones(n, bool)))
     single = albedo * hg_numpy(w.astype(np.float64) @ sun.astype(np.float64), g) * np.exp(-np.array(depth, np.float64))
     suns = np.broadcast_to(sun, (n, 1, 3))
-    j = trace_walks(field, points, w, np.full(n, g, np.float32), suns, np.full((n, 1), albedo, np.float32), 1, seed=streams[2])
+    j = trace_walks(field, points, w, np.full(n, g, np.float32), suns, np.full((n, 1), albedo, np.float32), 1, seed=streams[1])
     radiance = np.zeros(len(hit))
     radiance[hit] = single + albedo**2 * j[:, 0, 0, 0] / (4 * np.pi)
     return radiance

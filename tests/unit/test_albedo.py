@@ -13,7 +13,7 @@ from deepclouds.backend import backend
 from deepclouds.errors import InputError
 from deepclouds.medium.albedo import AlbedoField, AlbedoGrid
 from deepclouds.medium.field import Field
-from deepclouds.medium.one_sun import trace_one_sun
+from deepclouds.medium.one_sun import trace_to_escape
 from deepclouds.volume import Volume
 
 
@@ -53,12 +53,16 @@ def test_walks_in_a_constant_grid_are_walks_with_a_constant() -> None:
     points = (random.uniform(-0.2, 1.2, (n, 3)) @ m[:3, :3].T + m[:3, 3]).astype(np.float32)
     w, sun = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in random.normal(size=(2, n, 3)).astype(np.float32))
     phase = np.broadcast_to(np.array([0.6, 0, 1], np.float32), (n, 3))
-    constant = trace_one_sun(field, points, w, phase, sun, np.broadcast_to(albedos, (n, 2)), 16, 7)
+    x, w, phase, sun = (np.repeat(v, 16, axis=0) for v in (points, w, phase, sun))
+    constant, left = trace_to_escape(field, x, w, phase, sun, np.broadcast_to(albedos, (16 * n, 2)), 7)
     grid = AlbedoGrid(np.broadcast_to(albedos, (2, 3, 2, 2)), m)
-    varying = trace_one_sun(field, points, w, phase, sun, np.zeros((n, 1), np.float32), 16, 7, varying=AlbedoField(field, grid))
+    varying, escapes = trace_to_escape(field, x, w, phase, sun, np.zeros((n, 1), np.float32), 7, varying=AlbedoField(field, grid))
     # With a constant one more albedo is taken out.
     np.testing.assert_allclose(varying, constant * albedos, rtol=1e-5)
     assert varying.max() > 0
+    for a, b in zip(escapes.weight, left.weight, strict=True):
+        np.testing.assert_allclose(np.array(a), np.array(b), rtol=1e-5)
+    assert np.array(left.weight[1]).max() > 0
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.1, np.nan])

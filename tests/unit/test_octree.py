@@ -165,31 +165,29 @@ def test_a_source_of_one_adds_up_to_what_the_ray_hides(scale: float) -> None:
     points = np.random.default_rng(8).uniform(-1, 1, (500, 3))
     octree = Octree(lattice, lambda p: np.ones((len(p), 1), np.float32), points, np.ones(500), 0.1, 10**6, 1).upload(types)
     o, d, far = _upload(origin), _upload(direction), types.Float(math.inf)
-    jitter = types.Float(0.3)
-    tau, sums = gathered(field, [octree], o, d, far, jitter, types.Float(0.6), types.Bool(True))
-    whole = np.array(optical_depth(field, o, d, types.Float(0), far, jitter, types.Bool(True)))
+    tau, sums = gathered(field, [octree], o, d, far, types.Float(0.6), types.Bool(True))
+    whole = np.array(optical_depth(field, o, d, types.Float(0), far, types.Bool(True)))
     np.testing.assert_allclose(np.minimum(np.array(tau), 15), np.minimum(whole, 15), rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(np.array(sums[0][0]), -np.expm1(-whole), rtol=1e-4, atol=1e-6)
 
 
 def test_collisions_lie_in_equal_shares_of_what_is_hidden() -> None:
     field, origin, direction = _ball()
-    o, d, far, jitter = _upload(origin), _upload(direction), types.Float(math.inf), types.Float(0.5)
-    whole = np.array(optical_depth(field, o, d, types.Float(0), far, jitter, types.Bool(True)), np.float64)
+    o, d, far = _upload(origin), _upload(direction), types.Float(math.inf)
+    whole = np.array(optical_depth(field, o, d, types.Float(0), far, types.Bool(True)), np.float64)
     hidden, count, shift = -np.expm1(-whole), 5, 0.25
-    found = np.array(depths(field, o, d, far, jitter, types.Float(hidden.astype(np.float32)), types.Float(shift), count, types.Bool(True)))
+    found = np.array(depths(field, o, d, far, types.Float(hidden.astype(np.float32)), types.Float(shift), count, types.Bool(True)))
     found = found.reshape(-1, count)
     for k in range(count):
         end = types.Float(np.ascontiguousarray(found[:, k]))
-        before = np.array(optical_depth(field, o, d, types.Float(0), end, jitter, types.Bool(True)), np.float64)
-        # The two marches take other steps, so that they agree only as well as a march does.
+        before = np.array(optical_depth(field, o, d, types.Float(0), end, types.Bool(True)), np.float64)
         expected = (k + shift) / count * hidden
-        np.testing.assert_allclose(-np.expm1(-before)[hidden > 0.1], expected[hidden > 0.1], atol=0.02)
+        np.testing.assert_allclose(-np.expm1(-before)[hidden > 0.1], expected[hidden > 0.1], atol=1e-4)
     assert np.all(np.diff(found[hidden > 0.1], axis=1) > 0)
 
 
 def test_marches_leave_out_empty_bricks() -> None:
-    """Against fields of one brick, which is never empty: the same depths and sums to the bit, the same distances but for rounding."""
+    """Against fields of one brick, which is never empty: the same depths, sums and distances but for rounding."""
     rng, n = np.random.default_rng(10), 5000
     density = np.zeros((30, 41, 26), np.float32)
     for _ in range(20):
@@ -203,20 +201,22 @@ def test_marches_leave_out_empty_bricks() -> None:
     direction = rng.uniform(-1, 1, (n, 3)) - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     o, d, end = _upload(origin), _upload(direction), types.Float(rng.choice([2.0, 3.0, math.inf], n))
-    jitter, shift = (types.Float(rng.random(n).astype(np.float32)) for _ in range(2))
+    shift = types.Float(rng.random(n).astype(np.float32))
     results = []
     for brick in (None, 4):
         field = Field(types, volume, 8.0, brick=brick)
         assert field.majorants.any_empty == (brick is not None)
-        tau, sums = gathered(field, [octree], o, d, end, jitter, types.Float(0.6), types.Bool(True))
-        found = depths(field, o, d, end, jitter, 1 - dr.exp(-tau), shift, 3, types.Bool(True))
+        tau, sums = gathered(field, [octree], o, d, end, types.Float(0.6), types.Bool(True))
+        found = depths(field, o, d, end, 1 - dr.exp(-tau), shift, 3, types.Bool(True))
         results.append((np.array(tau), np.array(sums[0][0]), np.array(found)))
     (tau_plain, sum_plain, plain), (tau, total, skipping) = results
     assert np.count_nonzero(tau_plain) > 500
     assert sum_plain.max() > 0
-    np.testing.assert_array_equal(tau, tau_plain)
-    np.testing.assert_array_equal(total, sum_plain)
-    np.testing.assert_allclose(skipping.reshape(n, 3)[tau > 0], plain.reshape(n, 3)[tau > 0], rtol=1e-6)
+    np.testing.assert_allclose(tau, tau_plain, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(total, sum_plain, atol=0.05 * sum_plain.max())
+    assert total.mean() == pytest.approx(sum_plain.mean(), rel=1e-3)
+    # Of what is thinner rounding decides where the last share of it lies.
+    np.testing.assert_allclose(skipping.reshape(n, 3)[tau > 1e-3], plain.reshape(n, 3)[tau > 1e-3], rtol=1e-4)
 
 
 def test_harmonics_keep_what_varies_slowly() -> None:

@@ -73,7 +73,6 @@ def make_shard(
         types.Array3f(np.ascontiguousarray(suns.reshape(-1, 3).T)),
         types.Float(0),
         types.Float(np.inf),
-        types.Float(0.5),
         types.Bool(True),
         opaque=1e9,
     )

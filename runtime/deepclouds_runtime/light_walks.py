@@ -1,0 +1,194 @@
+"""Walks under all lights of a scene: J of one walk a point, for audits and for images that are path-traced."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import drjit as dr
+import numpy as np
+
+from deepclouds.backend import lanes_of, rows
+from deepclouds.medium.albedo import AlbedoField
+from deepclouds.medium.field import Field
+from deepclouds.medium.one_sun import Escapes, trace_to_escape
+from deepclouds_runtime.frame_source import upload
+from deepclouds_runtime.lights import BrightPart, Environment, Shade, on_host
+from deepclouds_runtime.octree import Array
+from deepclouds_runtime.scene_lights import Sun
+from deepclouds_runtime.stratified import Stratified
+from deepclouds_runtime.transport import Cloud, Lights, taker
+
+# Directions of an environment that are so many times brighter than its mean are connected to, as a sun is: walks seldom leave toward them.
+_BRIGHT = 8.0
+
+
+class LightWalks:
+    """Estimates J by walks: unbiased, and noisy.
+
+    Parameters
+    ----------
+    cloud, lights
+        the medium and all that lights it.
+    """
+
+    def __init__(self, cloud: Cloud, lights: Lights) -> None:
+        self._cloud, self._lights = cloud, lights
+        self._bright = []
+        for source, _ in lights.sources:
+            part = source.bright_part(_BRIGHT) if isinstance(source, Environment) else None
+            if part is not None:
+                self._bright.append(_OfBright(source, part))
+        self._connected: list[_Connected] = [_OfSun(sun, lights.shade) for sun in lights.suns if max(sun.irradiance) > 0]
+        self._connected += self._bright
+
+    def __call__(self, points: Array, along: Array, random: np.random.Generator) -> Array:
+        """J (n, channels) of one walk a point, at world points (n, 3) seen along unit vectors (n, 3).
+
+        A walk is connected to one sun, which is drawn for it, and sees all other light where it leaves the cloud.
+        """
+        n = len(points)
+        key = int(random.integers(1 << 32))
+        result = np.zeros((n, len(self._cloud.albedo)))
+        if not any(self._cloud.albedo) or not (self._connected or self._lights.sources):
+            return result
+        power = np.array([light.power for light in self._connected])
+        share = power / power.sum() if len(power) else np.ones(1)
+        # As many walks for each as it has light, and no walk knows which are beside it.
+        places = (random.permutation(n) + random.random()) / n
+        which = np.minimum(np.searchsorted(np.cumsum(share), places, side="right"), len(share) - 1)
+        for number, of_light in enumerate(share):
+            chosen = np.flatnonzero(which == number)
+            if len(chosen):
+                light = self._connected[number] if self._connected else None
+                result[chosen] = self._of_one(points[chosen], along[chosen], light, float(of_light), key + number, random)
+        return result
+
+    def _of_one(self, points: Array, along: Array, light: _Connected | None, share: float, key: int, random: np.random.Generator) -> Array:
+        """J (n, channels) of walks that are connected to `light`, a `share` of all."""
+        cloud, types, n = self._cloud, self._cloud.field.types, len(points)
+        own = on_host(cloud.albedo_at(upload(types, points)), n)
+        if cloud.varying is None:
+            albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
+            # Which of them each channel has; a black one has any.
+            column = [albedos.index(a) if a > 0 else 0 for a in cloud.albedo]
+        else:
+            albedos, column = (), list(range(len(cloud.albedo)))
+        toward, arriving = (None, np.zeros((n, len(column)))) if light is None else light.arriving(types, points, random)
+        j, escapes = trace_to_escape(
+            cloud.field,
+            points.astype(np.float32),
+            along.astype(np.float32),
+            np.broadcast_to(np.array(cloud.phase, np.float32), (n, 3)),
+            toward,
+            np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos))),
+            key & 0xFFFFFFFF,
+            varying=cloud.varying,
+            watched=bool(self._lights.sources),
+        )
+        seen = self._seen(escapes, n, key)
+        result = np.zeros((n, len(column)))
+        for c, m in enumerate(column):
+            # The next collision's albedo is in the walk where it varies.
+            next_one = own[:, c] if cloud.varying is None else 1.0
+            result[:, c] = own[:, c] * (arriving[:, c] * next_one * j[:, m] / (4 * math.pi * share) + seen[m][:, c])
+        return result
+
+    def _seen(self, escapes: Escapes, n: int, key: int) -> list[Array]:
+        """Radiance times weight (n, channels) that walks see where they leave the cloud, for each albedo."""
+        types, channels = self._cloud.field.types, len(self._cloud.albedo)
+        result = [np.zeros((n, channels)) for _ in escapes.weight]
+        heaviest = escapes.weight[0]
+        for weight in escapes.weight[1:]:
+            heaviest = dr.maximum(heaviest, weight)
+        lanes: Any = dr.compress(heaviest > 0)
+        if not self._lights.sources or len(lanes) == 0:
+            return result
+        take = taker(types, lanes)
+        direction, where = take(escapes.direction), np.array(lanes)
+        m = self._cloud.field.volume.to_world
+        unit = rows(take(escapes.position)).astype(np.float64)
+        x = upload(types, unit @ m[:3, :3].T + m[:3, 3])
+        one = dr.opaque(types.UInt32, 1)
+        total = np.zeros((len(lanes), channels))
+        for number, (source, _) in enumerate(self._lights.sources):
+            numbers = Stratified(types, lanes, dr.full(types.UInt32, number, len(lanes)), one, dr.opaque(types.UInt32, key & 0xFFFFFFFF))
+            light = source.arriving(x, direction, numbers.unrelated())
+            for part in self._bright:
+                if part.of is source:
+                    light = [dr.select(part.part.holds(direction), 0, value) for value in light]
+            total += on_host(light, len(lanes))
+        for values, weight in zip(result, escapes.weight, strict=True):
+            values[where] = total * np.array(take(weight), np.float64)[:, None]
+        return result
+
+
+class Paths:
+    """J by path tracing, for an image: a walk for each point, with random numbers of its own in every call.
+
+    Parameters
+    ----------
+    field, albedo, phase, varying
+        see `deepclouds_runtime.transport.Cloud`.
+    seed
+        of all random numbers.
+    """
+
+    def __init__(
+        self, field: Field, albedo: tuple[float, ...], phase: tuple[float, float, float], varying: AlbedoField | None, seed: int
+    ) -> None:
+        self._cloud = Cloud(field, albedo, phase, None, varying=varying)
+        self._streams = np.random.SeedSequence([seed & 0xFFFFFFFF, 0x9A75])
+        self._walks: list[tuple[Lights, LightWalks]] = []
+
+    def __call__(self, lights: Lights, points: Any, w: Any) -> Array:
+        """J (n, channels) at points (Array3f) seen along unit vectors `w`."""
+        # The lights of a render are few: those of the surfaces, and those of the cloud.
+        known = [walks for of, walks in self._walks if of is lights]
+        if not known:
+            known = [LightWalks(self._cloud, lights)]
+            self._walks.append((lights, known[0]))
+        (own,) = self._streams.spawn(1)
+        n = dr.width(points)
+        return known[0](rows(points), np.broadcast_to(rows(w), (n, 3)), np.random.default_rng(own))
+
+
+class _Connected(Protocol):
+    """A light that walks are connected to."""
+
+    power: float
+
+    def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
+        """Directions (n, 3) TOWARD the light, one a walk, and the irradiance (n, channels) at the points from there."""
+        ...
+
+
+class _OfSun:
+    """A sun."""
+
+    def __init__(self, sun: Sun, shade: Shade) -> None:
+        self._sun, self._shade = sun, shade
+        self.power = max(sun.irradiance)
+
+    def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
+        n = len(points)
+        omega = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in self._sun.omega_sun))
+        visible = np.broadcast_to(np.array(self._shade.visible(upload(types, points), omega)), n)
+        toward = np.broadcast_to(np.array(self._sun.omega_sun, np.float32), (n, 3))
+        return toward, visible[:, None] * np.array(self._sun.irradiance, np.float64)
+
+
+class _OfBright:
+    """What is bright of an environment: a direction for each walk."""
+
+    def __init__(self, of: Environment, part: BrightPart) -> None:
+        self.of, self.part, self.power = of, part, part.irradiance
+
+    def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
+        n = len(points)
+        u, v = (np.minimum((np.argsort(random.random(n)) + random.random(n)) / n, 1 - 1e-7) for _ in range(2))
+        omega, density = self.part.light.sample(*(lanes_of(types.Float, t) for t in (u, v)))
+        # A direction at a cell's edge may fall into the next one, which escapes see.
+        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.arriving(upload(types, points), omega, None)]
+        dr.eval(omega, light)
+        return np.broadcast_to(rows(omega), (n, 3)), on_host(light, n)
