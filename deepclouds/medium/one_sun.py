@@ -129,7 +129,7 @@ def trace_to_escape(
         return np.zeros((n, m_albedos), np.float32), Escapes(types, n, m_albedos)
     if n * m_albedos >= 2**31:
         raise ValueError(f"{n} walks at once need more than 2^31 results: trace fewer points a call")
-    toward = np.broadcast_to(np.float32([0, 0, 1]), (n, 3)) if suns is None else suns
+    toward = np.broadcast_to(np.array([0, 0, 1], np.float32), (n, 3)) if suns is None else suns
     job = _Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
     escapes = Escapes(types, n, m_albedos)
     dr.make_opaque(escapes.position, escapes.direction, escapes.weight)

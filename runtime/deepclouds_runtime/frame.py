@@ -24,7 +24,8 @@ from deepclouds_runtime.confidence import confidence, relative_errors
 from deepclouds_runtime.disc import background, looks_into
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.film import Film
-from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_beams, from_source, from_suns, seen_by
+from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_beams, from_source, from_suns, of_beams, seen_by
+from deepclouds_runtime.light_walks import BRIGHT, LightWalks
 from deepclouds_runtime.lights import Environment
 from deepclouds_runtime.result import Image
 from deepclouds_runtime.scattering import NetworkScattering
@@ -33,6 +34,7 @@ from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.surfaces import diffuse_share, reflected, reflected_from_cloud
 from deepclouds_runtime.thrown import ThrownLight
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
+from deepclouds_runtime.walked_source import walked_source
 
 # Noise of a pixel that the fast mode aims at, over the mean.
 ERROR = 0.02
@@ -47,6 +49,8 @@ _BUDGET = 60_000
 _BEAMS, _BRIGHT = 48, 0.1
 # The same for light that the cloud throws on surfaces, and for that of surfaces which it throws back to them.
 _BEAMS_THROWN, _BEAMS_BACK = 12, 4
+# Most walks at nodes for light from all around, and the longest edge of a box, in mean free paths, through which they are still cheap.
+_WALKS_AROUND, _LONGEST = 1 << 21, 1000.0
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
@@ -130,6 +134,15 @@ class Frame:
             "equal colour channels": sum(s.queries for s in self.sources) // max(distinct, 1) * (len(self.cloud.albedo) - distinct),
             "suns without power": sum(max(sun.irradiance) <= 0 for sun in self.on_cloud.suns),
         }
+
+    @property
+    def _walkable(self) -> bool:
+        """Whether walks through the cloud are short enough to be started at nodes."""
+        network = self.cloud.scattering
+        if not isinstance(network, NetworkScattering) or network.descriptor.empty:
+            return False
+        longest = float(np.linalg.norm(self.cloud.field.volume.to_world[:3, :3], axis=0).max())
+        return longest <= _LONGEST * network.descriptor.unit
 
     @property
     def _roughly(self) -> Cloud:
@@ -228,20 +241,36 @@ class Frame:
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
         wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
+        walked, bright = corrected and self._walkable, 0.0
         for source, _ in self.on_cloud.sources:
+            if walked and isinstance(source, Environment) and (part := source.bright_part(BRIGHT)) is not None:
+                suns += of_beams(self.types, part.light, part.beams(), True, self.seed)
+                bright += part.irradiance
             around += from_source(self.types, source, beams, isinstance(source, Environment), self.seed)
-        # What is a large part of all light gets the fine nodes of a sun.
         power = sum(max(light.irradiance) for light in around)
-        suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
-        around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
+        if not walked:
+            # What is a large part of all light gets the fine nodes of a sun.
+            suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
+            around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
         # Errors of both are independent: each may be the larger the less light it has.
         parts = [sum(max(light.irradiance) for light in lights) for lights in (suns, around)]
+        parts[1] = max(parts[1] - bright, 0.0)
         of_suns, of_around = (tolerance / math.sqrt(max(part / max(sum(parts), 1e-30), 1e-6)) for part in parts)
         of_suns *= _CORRECTED if corrected else 1.0
         found = {
             "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, of_suns, _BUDGET),
-            "light from all around": frame_source(self._roughly, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET),
         }
+        if walked and self.on_cloud.sources:
+            walks = LightWalks(self.cloud, self.on_cloud, smooth=True)
+            network = self.cloud.scattering
+            assert isinstance(network, NetworkScattering)
+            found["light from all around"] = walked_source(
+                self.cloud, network, walks, self.camera, seen, _ROOT_AROUND, of_around, _WALKS_AROUND, self.seed
+            )
+        else:
+            found["light from all around"] = frame_source(
+                self._roughly, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET
+            )
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
         self.errors = relative_errors(self.sources, seen, np.array(pixel), self.scene.size)

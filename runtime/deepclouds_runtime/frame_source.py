@@ -197,6 +197,11 @@ def from_suns(types: Any, suns: Sequence[Sun], shade: Shade) -> list[Arriving]:
 
 def from_source(types: Any, source: LightSource, count: int, plain: bool, seed: int) -> list[Arriving]:
     """A light from all around as `count` directions, chosen once for the frame."""
+    return of_beams(types, source, source.beams(count), plain, seed)
+
+
+def of_beams(types: Any, source: LightSource, beams: Sequence[Beam], plain: bool, seed: int) -> list[Arriving]:
+    """Some of the beams of a light from all around."""
 
     def of(beam: Beam) -> Arriving:
         def at(points: Any) -> list[Any]:
@@ -208,7 +213,7 @@ def from_source(types: Any, source: LightSource, count: int, plain: bool, seed: 
 
         return Arriving(beam.omega, beam.irradiance, at, plain)
 
-    return [of(beam) for beam in source.beams(count) if max(beam.irradiance) > 0]
+    return [of(beam) for beam in beams if max(beam.irradiance) > 0]
 
 
 def from_beams(types: Any, source: LightSource, count: int) -> list[Arriving]:
@@ -260,12 +265,63 @@ def frame_source(
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
     if not albedos or not lights or not len(seen.points) or not isinstance(network, NetworkScattering) or network.descriptor.empty:
         return None
-    field = cloud.field
     predicted = _Predicted(cloud, network, lights, albedos, eyes, combine)
+    nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
+    checks = max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes)))
+    return interpolated(cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every)
+
+
+class Evaluates(Protocol):
+    """What an octree interpolates.
+
+    Attributes
+    ----------
+    mix, queries, model
+        see `FrameSource`.
+    carried
+        so many of the fields are not J but the sum of the others and the error to expect of it.
+    """
+
+    mix: Array
+    queries: int
+    model: str
+    carried: int
+
+    def __call__(self, points: Array) -> Array:
+        """Fields (n, l), float32, at world points (n, 3)."""
+        ...
+
+
+def interpolated(
+    field: Field,
+    network: NetworkScattering,
+    evaluate: Evaluates,
+    seen: Seen,
+    root: float,
+    tolerance: float,
+    nodes: int,
+    checks: int,
+    lights: int,
+    every: int = 1,
+) -> FrameSource:
+    """What `evaluate` says at the nodes of an octree, interpolated.
+
+    Parameters
+    ----------
+    field, seen, root, tolerance, every
+        as for `frame_source`.
+    network
+        has the unit of length, and what nodes are aligned to.
+    nodes
+        most of them; the corners of the coarsest cells may be four times as many.
+    checks
+        points at which the interpolation is measured.
+    lights
+        how many there are, for a report.
+    """
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
-    nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     spacing, most = root * network.descriptor.unit, _OVERDRAWN * nodes
     while True:
         lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
@@ -274,15 +330,12 @@ def frame_source(
             break
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
-    checks = min(max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes))), len(seen.points) // 2)
-    held_out, built_for = _split(seen, checks)
-    octree = Octree(lattice, predicted, built_for.points, built_for.weights, tolerance, nodes, _LEVELS, predicted.carried)
+    held_out, built_for = _split(seen, min(checks, len(seen.points) // 2))
+    octree = Octree(lattice, evaluate, built_for.points, built_for.weights, tolerance, nodes, _LEVELS, evaluate.carried)
     device = octree.upload(field.types)
-    factor, error = _audit(device, predicted, held_out, every)
-    doubt = octree.upload(field.types, carried=True) if predicted.carried else None
-    path = getattr(network.predictor, "path", None)
-    model = "" if path is None else path.stem
-    return FrameSource(device, predicted.mix * factor, octree.statistics, error, predicted.queries, len(lights), model, doubt, octree)
+    factor, error = _audit(device, evaluate, held_out, every)
+    doubt = octree.upload(field.types, carried=True) if evaluate.carried else None
+    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, evaluate.queries, lights, evaluate.model, doubt, octree)
 
 
 class _Predicted:
@@ -299,6 +352,8 @@ class _Predicted:
     ) -> None:
         self._cloud, self._network, self._lights, self._albedos, self._eyes, self._combine = cloud, network, lights, albedos, eyes, combine
         self.queries = 0
+        path = getattr(network.predictor, "path", None)
+        self.model = "" if path is None else path.stem
         # What one eye sees is looked at itself; of several, only mixtures are.
         self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
         square = np.array(cloud.albedo) ** 2 / (4 * math.pi)

@@ -20,7 +20,7 @@ from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, Lights, taker
 
 # Directions of an environment that are so many times brighter than its mean are connected to, as a sun is: walks seldom leave toward them.
-_BRIGHT = 8.0
+BRIGHT = 8.0
 
 
 class LightWalks:
@@ -30,17 +30,26 @@ class LightWalks:
     ----------
     cloud, lights
         the medium and all that lights it.
+    smooth
+        leave out suns and what is bright of environments.
+
+    Attributes
+    ----------
+    lights
+        how many there are.
     """
 
-    def __init__(self, cloud: Cloud, lights: Lights) -> None:
+    def __init__(self, cloud: Cloud, lights: Lights, smooth: bool = False) -> None:
         self._cloud, self._lights = cloud, lights
         self._bright = []
         for source, _ in lights.sources:
-            part = source.bright_part(_BRIGHT) if isinstance(source, Environment) else None
-            if part is not None:
+            if isinstance(source, Environment) and (part := source.bright_part(BRIGHT)) is not None:
                 self._bright.append(_OfBright(source, part))
-        self._connected: list[_Connected] = [_OfSun(sun, lights.shade) for sun in lights.suns if max(sun.irradiance) > 0]
-        self._connected += self._bright
+        self._connected: list[_Connected] = []
+        if not smooth:
+            self._connected += [_OfSun(sun, lights.shade) for sun in lights.suns if max(sun.irradiance) > 0]
+            self._connected += self._bright
+        self.lights = len(self._connected) + len(lights.sources)
 
     def __call__(self, points: Array, along: Array, random: np.random.Generator) -> Array:
         """J (n, channels) of one walk a point, at world points (n, 3) seen along unit vectors (n, 3).
@@ -189,6 +198,6 @@ class _OfBright:
         u, v = (np.minimum((np.argsort(random.random(n)) + random.random(n)) / n, 1 - 1e-7) for _ in range(2))
         omega, density = self.part.light.sample(*(lanes_of(types.Float, t) for t in (u, v)))
         # A direction at a cell's edge may fall into the next one, which escapes see.
-        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.arriving(upload(types, points), omega, None)]
+        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.seen(upload(types, points), omega)]
         dr.eval(omega, light)
         return np.broadcast_to(rows(omega), (n, 3)), on_host(light, n)

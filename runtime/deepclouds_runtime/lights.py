@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
@@ -24,6 +25,8 @@ _SKY = (64, 128)
 _UNIFORM_ROWS = 16
 # How much the size of a part of the sky counts beside its light when it is split: with 0 one dark half could stay whole.
 _PART_SIZE = 0.5
+# Most directions that stand for what is bright of an environment, and how close, in degrees, they are one.
+_MOST_BRIGHT, _TOGETHER = 24, 8.0
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -147,6 +150,10 @@ class Environment:
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance past the surfaces; see `LightSource`."""
+        return self.seen(points, direction)
+
+    def seen(self, points: Any, direction: Any) -> list[Any]:
+        """The same: it takes no random numbers."""
         seen = self._shade.visible(points, direction)
         return [dr.select(seen, value, 0) for value in self.radiance(direction)]
 
@@ -269,6 +276,23 @@ class BrightPart:
     def holds(self, direction: Any) -> Any:
         """Whether directions belong to it."""
         return self.light.lookup(self._inside, direction) > 0.5
+
+    def beams(self) -> list[Beam]:
+        """Directions that stand for all of it: one for what lies within some degrees."""
+        merged: list[list[Beam]] = []
+        for beam in sorted(self.light.beams(_MOST_BRIGHT), key=lambda b: -max(b.irradiance)):
+            near = [part for part in merged if np.dot(part[0].omega, beam.omega) > math.cos(math.radians(_TOGETHER))]
+            if near:
+                near[0].append(beam)
+            else:
+                merged.append([beam])
+        beams = []
+        for part in merged:
+            middle = np.sum([np.array(beam.omega) * max(beam.irradiance) for beam in part], axis=0)
+            x, y, z = (float(v) for v in middle / np.linalg.norm(middle))
+            irradiance = np.sum([beam.irradiance for beam in part], axis=0)
+            beams.append(Beam((x, y, z), sum(beam.solid_angle for beam in part), tuple(float(v) for v in irradiance)))
+        return beams
 
 
 def _cumulative(weight: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -97,16 +97,16 @@ def test_along_axes_on_planes_of_samples_and_from_far_away() -> None:
     v = volume()
     lower, upper = v.bounds
     size, middle = (upper - lower) / v.resolution, (lower + upper) / 2
-    o, d = [], []
+    origins, directions = [], []
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
         for sample in (lower + 2.5 * size, lower + 0.5 * size, middle, lower + (2, 1.5, 2.5) * size):
-            o.append(np.where(axis != 0, middle - 5 * axis, sample))
-            d.append(axis)
+            origins.append(np.where(axis != 0, middle - 5 * axis, sample))
+            directions.append(axis)
     through = np.array([[1, 1, 0], [1, -1, 1], [0, 1, 1], [-1, 1, 1]]) * size
     for direction in through / np.linalg.norm(through, axis=1, keepdims=True):
-        o.append(lower + 2.5 * size - 4 * direction)
-        d.append(direction)
-    o, d = np.array(o), np.array(d)
+        origins.append(lower + 2.5 * size - 4 * direction)
+        directions.append(direction)
+    o, d = np.array(origins), np.array(directions)
     field = Field(backend(), v, 3.0)
     np.testing.assert_allclose(march(field, o, d), 3 * exact(v, o, d), rtol=3e-5, atol=1e-5)
     far = o - 1000 * d
