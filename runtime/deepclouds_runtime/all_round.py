@@ -19,12 +19,17 @@ from numpy.typing import NDArray
 
 from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.correction import FLOOR
-from deepclouds_runtime.frame_source import Arriving, FrameSource, Seen, frame_source, upload
+from deepclouds_runtime.frame_source import Arriving, Seen, frame_source, upload
+from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import on_host
+from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.transport import Cloud
+from deepclouds_runtime.walked_source import walked_source
 
 Array = NDArray[Any]
 DIRECTIONS = 16
+# Walks in the place of a query of the budget.
+_WALKS_A_QUERY = 16
 _HARMONICS = 9
 
 
@@ -54,11 +59,15 @@ class AllRound:
         (n,) how much the light from there counts in the image.
     root, tolerance, budget
         see `frame_source`.
+    walks
+        estimate J of more light, at nodes of their own; None for no more.
+    seed
+        of their random numbers.
 
     Attributes
     ----------
-    source
-        harmonics of J at the nodes, or None where it is 0 everywhere.
+    sources
+        harmonics of J at the nodes; none where it is 0 everywhere.
     queries
         asked of the network.
     factor
@@ -70,13 +79,26 @@ class AllRound:
     """
 
     def __init__(
-        self, cloud: Cloud, lights: Sequence[Arriving], seen: Seen, along: Array, counts: Array, root: float, tolerance: float, budget: int
+        self,
+        cloud: Cloud,
+        lights: Sequence[Arriving],
+        seen: Seen,
+        along: Array,
+        counts: Array,
+        root: float,
+        tolerance: float,
+        budget: int,
+        walks: LightWalks | None = None,
+        seed: int = 0,
     ) -> None:
-        self.source: FrameSource | None = frame_source(
-            cloud, lights, [Direction(w) for w in spread(DIRECTIONS)], seen, root, tolerance, budget, fit, _HARMONICS
-        )
+        eyes = [Direction(w) for w in spread(DIRECTIONS)]
+        found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS)]
+        if walks is not None and isinstance(cloud.scattering, NetworkScattering):
+            most = _WALKS_A_QUERY * budget
+            found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, most, seed, fit, _HARMONICS))
+        self.sources = [source for source in found if source is not None]
         self._channels, self._types = len(cloud.albedo), cloud.field.types
-        self.queries = 0 if self.source is None else self.source.queries
+        self.queries = sum(source.queries for source in self.sources)
         self.seen, self.along, self.counts = seen, along, counts
         self.again: AllRound | None = None
         self.factor = np.ones(self._channels)
@@ -89,16 +111,17 @@ class AllRound:
         return [value * dr.opaque(self._types.Float, float(f)) for value, f in zip(total, self.factor, strict=True)]
 
     def _own(self, points: Any, w: Any) -> list[Any]:
-        if self.source is None:
-            return [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
-        octree = self.source.octree
-        values = octree.lookup(octree.to_local(points), self._types.Bool(True))
+        total = [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
         basis = harmonics(w.x, w.y, w.z)
-        sums = []
-        for f in range(len(values) // _HARMONICS):
-            terms = [b * v for b, v in zip(basis, values[f * _HARMONICS : (f + 1) * _HARMONICS], strict=True)]
-            sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
-        return self.source.colours(sums)
+        for source in self.sources:
+            octree = source.octree
+            values = octree.lookup(octree.to_local(points), self._types.Bool(True))
+            sums = []
+            for f in range(len(values) // _HARMONICS):
+                terms = [b * v for b, v in zip(basis, values[f * _HARMONICS : (f + 1) * _HARMONICS], strict=True)]
+                sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
+            total = [a + b for a, b in zip(total, source.colours(sums), strict=True)]
+        return total
 
     def correct(self, walks: Walks, count: int, seed: int) -> dict[str, Any]:
         """Set `factor` by `count` walks from points that surfaces see; returns it and its standard deviation, for a report.
@@ -106,7 +129,7 @@ class AllRound:
         The factor is the ratio of the means of what walks find and of what is predicted, drawn toward 1 as far as chance explains it.
         """
         points, along, weights = self.seen.points, self.along, self.seen.weights * self.counts
-        if self.source is None or not weights.sum() > 0:
+        if not self.sources or not weights.sum() > 0:
             return {}
         x, w = upload(self._types, points), upload(self._types, along)
         predicted = on_host(self(x, w), len(points))

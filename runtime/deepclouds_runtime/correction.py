@@ -32,6 +32,8 @@ _POOLED = 2
 _BLOCK = 3
 # Agreement of the halves, in standard deviations of what chance would give, that does not count.
 CHANCE = 0.5
+# Lattices with fewer walks a node, and all finer ones, are left out: they would cost the most and be believed the least.
+_SPARSE = 4
 # Independent groups of walks.
 GROUPS = 4
 
@@ -114,6 +116,8 @@ class Correction:
             size = cells_along(sums.edges, level)
             field = _refined(field, size, level)
             index, tent, count = _tents(place, size, level)
+            if sums.count.sum() < _SPARSE * np.count_nonzero(_at_nodes(np.ones(len(cells)), index, tent, count)):
+                break
             values = np.zeros((count, channels))
             for c in range(channels):
                 left = [_at_nodes(r[c] - s[c] * known[c], index, tent, count) for r, s in zip(residual, scale, strict=True)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,7 +26,7 @@ from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.film import Film
 from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_beams, from_source, from_suns, of_beams, seen_by
 from deepclouds_runtime.light_walks import BRIGHT, LightWalks
-from deepclouds_runtime.lights import Environment
+from deepclouds_runtime.lights import Environment, LightSource
 from deepclouds_runtime.result import Image
 from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene import CloudScene
@@ -153,7 +153,18 @@ class Frame:
         """The cloud as surfaces see it."""
         return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
 
-    def prepare_thrown(self, tolerance: float) -> None:
+    def _walked(self, sources: Sequence[tuple[LightSource, int]], corrected: bool) -> LightWalks | None:
+        """Walks for what is not bright of `sources`, where an image is corrected by walks anyway."""
+        if not corrected or not sources or not self._walkable:
+            return None
+        return LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade), smooth=True)
+
+    def _bright(self, sources: Sequence[tuple[LightSource, int]]) -> list[Arriving]:
+        """What is bright of environments, as suns."""
+        parts = [source.bright_part(BRIGHT) for source, _ in sources if isinstance(source, Environment)]
+        return [light for part in parts if part for light in of_beams(self.types, part.light, part.beams(), True, self.seed)]
+
+    def prepare_thrown(self, tolerance: float, corrected: bool = False) -> None:
         """Predict multiple scattering for the light that the cloud throws on surfaces; from then on their rays ask no network."""
         clock = time.perf_counter()
         types = self.types
@@ -186,28 +197,34 @@ class Frame:
             counts = np.square(radius / np.maximum(np.linalg.norm(places - 0.5 * (lower + upper), axis=1), radius))
             counts[len(parts[0][0]) :] = 0
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
-            for source, _ in self.on_surfaces.sources:
-                lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            self.all_round = AllRound(
-                self._roughly, lights, seen, ahead[seen.rays], counts[seen.rays], _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4
-            )
+            walks = self._walked(self.on_surfaces.sources, corrected)
+            if walks is not None:
+                lights += self._bright(self.on_surfaces.sources)
+            else:
+                for source, _ in self.on_surfaces.sources:
+                    lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
+            where = seen, ahead[seen.rays], counts[seen.rays]
+            self.all_round = AllRound(self._roughly, lights, *where, _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed)
             self.counts.queries += self.all_round.queries
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
         self.spent("light on surfaces", clock)
 
-    def prepare_thrown_back(self, tolerance: float) -> None:
+    def prepare_thrown_back(self, tolerance: float, corrected: bool = False) -> None:
         """The same for what surfaces send to the cloud, and it back to them: once, in the light that `on_cloud` has of them."""
         first = self.all_round
         if first is None:
             return
         clock = time.perf_counter()
         lights: list[Arriving] = []
-        for source, _ in self.on_cloud.sources[len(self.on_surfaces.sources) :]:
+        sources = self.on_cloud.sources[len(self.on_surfaces.sources) :]
+        walks = self._walked(sources, corrected)
+        for source, _ in sources if walks is None else ():
             # Of so few parts, what one point sees in the middle is a poor measure: a shadow there would stand for all.
             lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.
         wide = 2 * _THROWN * tolerance
-        first.again = AllRound(self._roughly, lights, first.seen, first.along, first.counts, _ROOT_AROUND, wide, _BUDGET // 4)
+        where = first.seen, first.along, first.counts
+        first.again = AllRound(self._roughly, lights, *where, _ROOT_AROUND, wide, _BUDGET // 4, walks, self.seed + 1)
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
@@ -241,32 +258,27 @@ class Frame:
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
         wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
-        walked, bright = corrected and self._walkable, 0.0
+        walks = self._walked(self.on_cloud.sources, corrected)
         for source, _ in self.on_cloud.sources:
-            if walked and isinstance(source, Environment) and (part := source.bright_part(BRIGHT)) is not None:
-                suns += of_beams(self.types, part.light, part.beams(), True, self.seed)
-                bright += part.irradiance
             around += from_source(self.types, source, beams, isinstance(source, Environment), self.seed)
         power = sum(max(light.irradiance) for light in around)
-        if not walked:
+        bright = [] if walks is None else self._bright(self.on_cloud.sources)
+        suns += bright
+        if walks is None:
             # What is a large part of all light gets the fine nodes of a sun.
             suns += [light for light in around if max(light.irradiance) > _BRIGHT * power]
             around = [light for light in around if max(light.irradiance) <= _BRIGHT * power]
         # Errors of both are independent: each may be the larger the less light it has.
         parts = [sum(max(light.irradiance) for light in lights) for lights in (suns, around)]
-        parts[1] = max(parts[1] - bright, 0.0)
+        parts[1] = max(parts[1] - sum(max(light.irradiance) for light in bright), 0.0)
         of_suns, of_around = (tolerance / math.sqrt(max(part / max(sum(parts), 1e-30), 1e-6)) for part in parts)
         of_suns *= _CORRECTED if corrected else 1.0
         found = {
             "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, of_suns, _BUDGET),
         }
-        if walked and self.on_cloud.sources:
-            walks = LightWalks(self.cloud, self.on_cloud, smooth=True)
-            network = self.cloud.scattering
-            assert isinstance(network, NetworkScattering)
-            found["light from all around"] = walked_source(
-                self.cloud, network, walks, self.camera, seen, _ROOT_AROUND, of_around, _WALKS_AROUND, self.seed
-            )
+        if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
+            how = seen, _ROOT_AROUND, of_around, _WALKS_AROUND, self.seed
+            found["light from all around"] = walked_source(self.cloud, self.cloud.scattering, walks, [self.camera], *how)
         else:
             found["light from all around"] = frame_source(
                 self._roughly, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET

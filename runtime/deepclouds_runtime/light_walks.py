@@ -13,7 +13,7 @@ from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.medium.one_sun import Escapes, trace_to_escape
 from deepclouds_runtime.frame_source import upload
-from deepclouds_runtime.lights import BrightPart, Environment, Shade, on_host
+from deepclouds_runtime.lights import BrightPart, Environment, LightSource, Shade, on_host
 from deepclouds_runtime.octree import Array
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
@@ -122,7 +122,10 @@ class LightWalks:
         total = np.zeros((len(lanes), channels))
         for number, (source, _) in enumerate(self._lights.sources):
             numbers = Stratified(types, lanes, dr.full(types.UInt32, number, len(lanes)), one, dr.opaque(types.UInt32, key & 0xFFFFFFFF))
-            light = source.arriving(x, direction, numbers.unrelated())
+            if not isinstance(source, Environment):
+                total += _from_surfaces(types, source, x, direction, numbers.unrelated(), self._lights.shade, len(lanes), channels)
+                continue
+            light = source.seen(x, direction)
             for part in self._bright:
                 if part.of is source:
                     light = [dr.select(part.part.holds(direction), 0, value) for value in light]
@@ -130,6 +133,18 @@ class LightWalks:
         for values, weight in zip(result, escapes.weight, strict=True):
             values[where] = total * np.array(take(weight), np.float64)[:, None]
         return result
+
+
+def _from_surfaces(
+    types: Any, source: LightSource, points: Any, direction: Any, numbers: Stratified, shade: Shade, n: int, channels: int
+) -> Array:
+    """Radiance (n, channels) of what surfaces send back, which is worked out where there are some only."""
+    result = np.zeros((n, channels))
+    hit: Any = dr.compress(~shade.visible(points, direction))
+    if len(hit):
+        take = taker(types, hit)
+        result[np.array(hit)] = on_host(source.arriving(take(points), take(direction), numbers.take(hit)), len(hit))
+    return result
 
 
 class Paths:

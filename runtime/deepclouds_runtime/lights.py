@@ -26,7 +26,7 @@ _UNIFORM_ROWS = 16
 # How much the size of a part of the sky counts beside its light when it is split: with 0 one dark half could stay whole.
 _PART_SIZE = 0.5
 # Most directions that stand for what is bright of an environment, and how close, in degrees, they are one.
-_MOST_BRIGHT, _TOGETHER = 24, 8.0
+_MOST_BRIGHT, _TOGETHER = 24, 15.0
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 

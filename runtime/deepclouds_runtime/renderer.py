@@ -305,13 +305,13 @@ class Renderer:
             for network in filter(None, (self._network, frame.quick)):
                 network.stop = interrupted
             if adaptive and self._interreflection:
-                frame.prepare_thrown(_INTERPOLATION * error)
+                frame.prepare_thrown(_INTERPOLATION * error, correct)
             if self._interreflection:
                 clock = time.perf_counter()
                 reflectors = Reflectors(frame.thrower, lights, frame.seed & 0xFFFFFFFF, frame.counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
-                frame.prepare_thrown_back(_INTERPOLATION * error)
+                frame.prepare_thrown_back(_INTERPOLATION * error, correct)
             if self.mode == "fast" and not frame.sampled:
                 frame.prepare(_INTERPOLATION * error, corrected=correct)
         except Stopped:
@@ -341,9 +341,9 @@ class Renderer:
             noise if noise is not None and math.isfinite(noise) else None,
             complete,
         )
-        for name, source in (*frame.named.items(), ("light on surfaces", None if frame.all_round is None else frame.all_round.source)):
-            if source is not None:
-                statistics.sources[name] = source.summary()
+        thrown = () if frame.all_round is None else tuple(frame.all_round.sources)
+        for name, source in (*frame.named.items(), *((_thrown(k), source) for k, source in enumerate(thrown))):
+            statistics.sources[name] = source.summary()
         statistics.skipped = frame.skipped()
         statistics.audit = frame.found
         levels = 0 if self._network is None else self._network.descriptor.nbytes
@@ -376,6 +376,10 @@ class Renderer:
         if self.scene.environment is not None:
             sources.append((environment(self._types, self.scene.environment, shade), self.environment_directions))
         return Lights(self.scene.suns, tuple(sources), shade)
+
+
+def _thrown(number: int) -> str:
+    return "light on surfaces" if number == 0 else f"light on surfaces, {number + 1}"
 
 
 def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene) -> list[str]:
