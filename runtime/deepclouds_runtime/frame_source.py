@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from deepclouds.backend import lanes_of, rows
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
-from deepclouds_runtime.lights import Beam, LightSource, Shade
+from deepclouds_runtime.lights import Beam, LightSource, Shade, on_host
 from deepclouds_runtime.march import depths
 from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_around, root_nodes
-from deepclouds_runtime.scattering import NetworkScattering
+from deepclouds_runtime.scattering import Albedos, NetworkScattering
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, opacity_of, taker
@@ -34,6 +34,8 @@ _CHECKS, _LEAST_CHECKS = 512, 64
 # Queries that are prepared together.
 _AT_ONCE = 16384
 _DEEP = 1e6
+# Places around a point that tell what an albedo is there on the mean, and how far away they lie, in units of length.
+_AROUND, _REACH = 32, 2.0
 # Of a budget of queries, what the corners of the coarsest cells may take.
 _OVERDRAWN = 4
 
@@ -357,11 +359,14 @@ class _Predicted:
         # What one eye sees is looked at itself; of several, only mixtures are.
         self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
         square = np.array(cloud.albedo) ** 2 / (4 * math.pi)
-        tint = _tint(lights)
+        tint = _tint(lights) if cloud.varying is None else None
         self._brightest = -1
         # Which of the albedos each field belongs to.
         self._of_field = [albedos.index(a) if a > 0 else -1 for a in cloud.albedo]
-        if tint is None:
+        if cloud.varying is not None:
+            # Its albedos are part of each field.
+            self.mix, self._of_field = np.eye(len(cloud.albedo)) / (4 * math.pi), list(range(len(cloud.albedo)))
+        elif tint is None:
             self.mix = np.diag(square)
         else:
             self._brightest = int(np.argmax(tint))
@@ -390,11 +395,12 @@ class _Predicted:
         omega = upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
         tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Bool(True), _DEEP)
         dr.eval(tau)
-        query = x, d, omega, self._cloud.phase, self._albedos, tau
+        albedos, columns, square = self._at(points, len(pairs))
+        query = x, d, omega, self._cloud.phase, albedos, tau
         j, errors = self._network.with_errors(*query) if self.carried else (self._network(*query), None)
         self.queries += j.size
-        j = j.reshape(len(pairs), n, -1)
-        errors = np.zeros_like(j) if errors is None else errors.reshape(j.shape)
+        errors = np.zeros_like(j) if errors is None else errors
+        j, errors = (v[:, columns].reshape(len(pairs), n, -1) * square for v in (j, errors))
         x = upload(types, points)
         for (e, light), values, expected in zip(pairs, j, errors, strict=True):
             arriving = light.at(x)
@@ -405,6 +411,31 @@ class _Predicted:
                     total[e, :, f] += irradiance * values[:, k]
                     # Errors of several lights add up: what makes a network err under one sun does so under the next.
                     error += irradiance * expected[:, k]
+
+    def _at(self, points: Array, times: int) -> tuple[Albedos, list[int], Array]:
+        """The albedos to ask for at points that are repeated, which of them each field has, and what its values are multiplied by.
+
+        A network knows one albedo a query. Where it varies, that is its mean over the medium around the point: walks correct the rest.
+        """
+        varying, field = self._cloud.varying, self._cloud.field
+        if varying is None:
+            return self._albedos, list(range(len(self._albedos))), np.ones(1)
+        types, n = field.types, len(points)
+        own = on_host(self._cloud.albedo_at(upload(types, points)), n)
+        around = np.random.default_rng(_AROUND).normal(size=(_AROUND, 3)) * (_REACH * self._network.descriptor.unit)
+        places = upload(types, (points[:, None] + around).reshape(-1, 3))
+        sigma = np.array(field.sigma_t(places), np.float64).reshape(n, _AROUND, 1)
+        # Where nothing is near, as if there were.
+        sigma += 1e-3 * max(field.majorant, 1e-30)
+        mean = (on_host(varying(places), n * _AROUND).reshape(n, _AROUND, -1) * sigma).sum(axis=1) / sigma.sum(axis=1)
+        columns: list[int] = []
+        albedos: list[Array] = []
+        for c in range(mean.shape[1]):
+            same = [k for k in range(c) if np.array_equal(mean[:, k], mean[:, c])]
+            columns.append(columns[same[0]] if same else len(albedos))
+            if not same:
+                albedos.append(np.clip(np.tile(mean[:, c], times), 0, 1))
+        return albedos, columns, own * mean
 
 
 def upload(types: Any, values: Array) -> Any:

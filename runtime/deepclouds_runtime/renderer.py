@@ -128,8 +128,8 @@ class Renderer:
         self._field = Field(self._types, scene.volume, scene.scale)
         self._albedo = None if scene.varying is None else AlbedoField(self._field, scene.varying)
         self._network: NetworkScattering | None = None
-        # Whether paths are traced in place of the network, asked for or not.
-        self._walks = (unbiased or scene.varying is not None) and scene.max_depth != 2
+        # Whether paths are traced in place of the network, asked for or not; where the albedo varies, in images that walks do not correct.
+        self._walks = (unbiased or (self._albedo is not None and predictor is None)) and scene.max_depth != 2
         if scene.max_depth != 2 and not self._walks:
             if predictor is None:
                 raise InputError("multiple scattering needs a model; give one, or render single scattering alone (max_depth 2)")
@@ -139,10 +139,10 @@ class Renderer:
         self.notes = scene.notes
         if unbiased:
             self.notes += ("unbiased: paths are traced with our own tracker until the noise is as asked; no network is asked",)
-        elif self._walks:
+        elif self._albedo is not None and scene.max_depth != 2:
             self.notes += (
-                "the albedo varies in space, and the network knows one albedo a query: multiple scattering is path-traced in place of it, "
-                "noisy and slow",
+                "the albedo varies in space, and the network knows one albedo a query: it is asked with the mean around each point, and "
+                "walks correct that; in an image that is not corrected multiple scattering is path-traced, noisy and slow",
             )
         if self._network is not None and (unknown := _unknown(self._network, predictor, scene)):
             instead = "extrapolated" if extrapolate else "path-traced in place of it, noisy and slow ('extrapolate' asks it all the same)"
@@ -253,18 +253,21 @@ class Renderer:
             scattering = self._network
         adaptive = self.mode == "fast"
         # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
-        paths = Paths(self._field, scene.albedo, scene.phase, self._albedo, seed) if self._walks else None
+        walks = self._walks or (self._albedo is not None and not correct and scene.max_depth != 2)
+        paths = Paths(self._field, scene.albedo, scene.phase, self._albedo, seed) if walks else None
+        if walks:
+            scattering = None
         sampled = adaptive and (paths is not None or (scattering is not None and self._exact_orders > 1))
-        most = self.samples(spp) if spp is not None or not adaptive or (self._walks and not self.unbiased) else _MOST_AUTOMATIC
+        most = self.samples(spp) if spp is not None or not adaptive or (walks and not self.unbiased) else _MOST_AUTOMATIC
         if spp is None and self.unbiased:
             most = _MOST_SAMPLES
-        exact = 1 if self._walks else self._exact_orders
+        exact = 1 if walks else self._exact_orders
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo, paths), self._lights()
         camera = Camera(types, scene.sensor)
         quick = self._quicker if correct else None
         frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, sampled=sampled)
         frame.spent("lights", started)
-        if adaptive and not self._walks and partial is not None:
+        if adaptive and not walks and partial is not None:
             clock = time.perf_counter()
             look = self._quick_look(frame, lights)
             look.round(0, 1, most, None)
@@ -294,13 +297,13 @@ class Renderer:
                 say_ignored(None if timed else error, own)
             # Blocks that rested because their paths found little light by chance would make an unbiased image dark.
             end = math.inf if time_limit is None else started + time_limit
-            goal = _TIMED * error if timed and not self._walks else frame.noise_goal(error)
-            noise, stopped = rounds_for_error(frame, most, None if timed else goal, goal, end, not self._walks, watch, so_far)
+            goal = _TIMED * error if timed and not walks else frame.noise_goal(error)
+            noise, stopped = rounds_for_error(frame, most, None if timed else goal, goal, end, not walks, watch, so_far)
         return self._result(frame, started, noise, not stopped)
 
     def _prepared(self, frame: Frame, lights: Lights, error: float, correct: bool, interrupted: Callable[[], bool] | None) -> bool:
         """Predict what the frame interpolates, and see what surfaces send to the cloud; False where somebody stopped it."""
-        adaptive = self.mode == "fast" and not self._walks
+        adaptive = self.mode == "fast" and frame.cloud.paths is None
         try:
             for network in filter(None, (self._network, frame.quick)):
                 network.stop = interrupted
@@ -333,7 +336,7 @@ class Renderer:
         channels = frame.image()
         seconds = {"load": self._load_seconds, **frame.seconds, "total": time.perf_counter() - started}
         rgb = np.stack([channels[c] for c in COLOURS], axis=-1)
-        mode = "reference" if self.mode == "reference" else "path-traced" if self._walks else "fast"
+        mode = "reference" if self.mode == "reference" else "path-traced" if frame.cloud.paths is not None else "fast"
         statistics = Statistics(
             mode,
             int(frame.film.taken.max()),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from types import ModuleType
 from typing import Any, Protocol
@@ -19,6 +19,7 @@ from deepclouds.medium.phase import ordered_lobes
 from deepclouds.model import aux_inputs
 
 Phase = tuple[float, float, float]
+Albedos = Sequence[float | NDArray[np.float64]]
 # Stencils are 9 kB each: a chunk of them stays below 100 MB.
 _CHUNK = 8192
 
@@ -30,7 +31,7 @@ class Stopped(Exception):
 class MultipleScattering(Protocol):
     """Source of ``j = 4 pi J / (albedo^2 E)``."""
 
-    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: Albedos, tau: Any) -> NDArray[np.float32]:
         """Dimensionless j (n, albedos).
 
         Parameters
@@ -40,7 +41,7 @@ class MultipleScattering(Protocol):
         phase
             phase function (g1, g2, weight), see `deepclouds.medium.phase`.
         albedos
-            the DIFFERENT albedos among the colour channels.
+            the DIFFERENT albedos among the colour channels, each one value for all points, or one for each.
         tau
             Float: optical depth from the points toward the light.
         """
@@ -92,12 +93,12 @@ class NetworkScattering:
         trusted = getattr(getattr(predictor, "metadata", None), "trust", None) is not None
         self._errors: Callable[..., NDArray[np.float32]] | None = getattr(predictor, "errors", None) if trusted else None
 
-    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: Albedos, tau: Any) -> NDArray[np.float32]:
         """J of the points; see `MultipleScattering`."""
         return self._asked(points, w, omega_sun, phase, albedos, tau, None)[0]
 
     def with_errors(
-        self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any
+        self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: Albedos, tau: Any
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """J of the points, and the error to expect of each, both (n, albedos); only where `knows_errors`."""
         return self._asked(points, w, omega_sun, phase, albedos, tau, self._errors)
@@ -113,7 +114,7 @@ class NetworkScattering:
         w: Any,
         omega_sun: Any,
         phase: Phase,
-        albedos: tuple[float, ...],
+        albedos: Albedos,
         tau: Any,
         errors: Callable[..., NDArray[np.float32]] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -136,7 +137,8 @@ class NetworkScattering:
             for k, level in enumerate(self.descriptor.levels(*part)):
                 stencil[:, k] = level.numpy().reshape(-1, POINTS)
             for m, albedo in enumerate(albedos):
-                aux = aux_inputs(gamma[start:stop], *ordered_lobes(phase), albedo, depth[start:stop])
+                own = albedo if isinstance(albedo, float) else albedo[start:stop]
+                aux = aux_inputs(gamma[start:stop], *ordered_lobes(phase), own, depth[start:stop])
                 result[start:stop, m] = j = self.predictor.predict(stencil, aux)
                 if errors is not None:
                     expected[start:stop, m] = errors(stencil, aux, j)
@@ -160,7 +162,7 @@ class WalkScattering:
         self._field, self._walks = field, walks
         self._streams = np.random.SeedSequence(seed)
 
-    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: tuple[float, ...], tau: Any) -> NDArray[np.float32]:
+    def __call__(self, points: Any, w: Any, omega_sun: Any, phase: Phase, albedos: Albedos, tau: Any) -> NDArray[np.float32]:
         """J of the points; see `MultipleScattering`."""
         x, d, suns = (rows(v) for v in (points, w, omega_sun))
         n = len(x)
@@ -171,7 +173,7 @@ class WalkScattering:
             d,
             np.broadcast_to(np.array(phase, np.float32), (n, 3)),
             np.broadcast_to(suns, (n, 3)),
-            np.broadcast_to(np.array(albedos, np.float32), (n, len(albedos))),
+            np.stack([np.broadcast_to(np.asarray(a, np.float32), n) for a in albedos], axis=1),
             self._walks,
             seed,
             roulette=True,

@@ -11,6 +11,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from deepclouds_runtime._mitsuba import mitsuba
+from deepclouds_runtime.loading import load
 from numpy.typing import NDArray
 
 from deepclouds.cli import main
@@ -74,3 +76,47 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["render", str(file), "-o", str(tmp_path / "image.exr"), *flags]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "image.exr").exists()
+
+
+def test_a_corrected_image_asks_the_network_and_is_that_of_paths(tmp_path: Path) -> None:
+    """A ball, dark on one side in red and on the other in blue: walks take out what a mean albedo around each point gets wrong."""
+    c = (np.arange(24) + 0.5) / 12 - 1
+    z, y, x = np.meshgrid(c, c, c, indexing="ij")
+    ball = np.clip(4 * (0.9 - np.sqrt(x * x + y * y + z * z)), 0, 1).astype(np.float32)
+    write_vol(tmp_path / "ball.vol", Volume.from_box(ball, (-1, -1, -1), (1, 1, 1)))
+    side = 1 / (1 + np.exp(-8 * x))
+    colours = np.stack([0.7 + 0.3 * side, np.full_like(x, 0.95), 1 - 0.3 * side], axis=-1)
+    mitsuba().VolumeGrid(colours.astype(np.float32)).write(str(tmp_path / "albedo.vol"))
+    place = '<transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/><scale value="2"/></transform>'
+    scene = tmp_path / "scene.xml"
+    scene.write_text(f"""<scene version="3.0.0">
+      <sensor type="perspective"><float name="fov" value="34"/>
+        <transform name="to_world"><lookat origin="0.6, 1, 3.8" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="24"/><rfilter type="box"/></film>
+      </sensor>
+      <emitter type="directional"><vector name="direction" value="-0.3, -1, -0.8"/><rgb name="irradiance" value="3 3 3"/></emitter>
+      <emitter type="constant"><rgb name="radiance" value="0.1 0.2 0.3"/></emitter>
+      <shape type="cube"><bsdf type="null"/><medium type="heterogeneous" name="interior">
+        <float name="scale" value="12"/><phase type="hg"><float name="g" value="0.6"/></phase>
+        <volume type="gridvolume" name="albedo"><boolean name="raw" value="true"/>{place}
+          <string name="filename" value="albedo.vol"/></volume>
+        <volume type="gridvolume" name="sigma_t"><string name="filename" value="ball.vol"/>{place}</volume>
+      </medium></shape></scene>""")
+    renderer = load(scene)
+    halves = [renderer.render(2000, seed=s) for s in (1, 2)]
+    image, alone = (renderer.render(error=0.02, seed=3, **{how: True}) for how in ("correct", "audit"))
+    assert [r.statistics.mode for r in (*halves, image, alone)] == ["path-traced"] * 2 + ["fast", "path-traced"]
+    assert image.statistics.audit["corrected"]
+    assert image.counts.queries > 0
+    a, b = (np.stack([half.channels[f"volume_indirect.{c}"] for c in "RGB"], axis=-1).astype(np.float64) for half in halves)
+    ours = np.stack([image.channels[f"volume_indirect.{c}"] for c in "RGB"], axis=-1).astype(np.float64)
+    mean = 0.5 * (a + b)
+    # Red is dark where blue is bright: no one colour would do.
+    lit = mean[..., 1] > 0.3 * mean[..., 1].max()
+    ratio = (mean[..., 0] / np.maximum(mean[..., 2], 1e-9))[lit]
+    assert np.quantile(ratio, 0.9) > 2 * np.quantile(ratio, 0.1)
+    error = np.sqrt(max(float(np.mean((ours - a) * (ours - b))), 0.0)) / mean.mean()
+    noise = np.sqrt(float(np.mean(np.square(a - b))) / 2) / mean.mean()
+    assert noise < 0.15
+    assert error < 0.04
+    np.testing.assert_allclose(ours.mean(axis=(0, 1)), mean.mean(axis=(0, 1)), rtol=0.015)

@@ -285,11 +285,19 @@ def test_no_walks_correct_nothing() -> None:
     assert not nothing(np.random.default_rng(1).random((10, 3))).any()
 
 
-@pytest.mark.parametrize(("correct", "model", "around"), [(True, None, "fast"), (False, None, "accurate"), (True, "fast", "fast")])
-def test_light_from_all_around_is_asked_of_the_quick_model(
-    scene: Path, monkeypatch: pytest.MonkeyPatch, correct: bool, model: str | None, around: str
+@pytest.mark.parametrize(
+    ("correct", "model", "longest", "expected"),
+    [
+        (True, None, 1000.0, {"light from all around": "", "light on surfaces": "fast", "light on surfaces, 2": ""}),
+        (True, None, 1.0, {"light from all around": "fast", "light on surfaces": "fast"}),
+        (False, None, 1000.0, {"light from all around": "accurate", "light on surfaces": "accurate"}),
+        (True, "fast", 1.0, {"light from all around": "fast", "light on surfaces": "fast"}),
+    ],
+)
+def test_light_from_all_around_is_walked_or_asked_of_the_quick_model(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, correct: bool, model: str | None, longest: float, expected: dict[str, str]
 ) -> None:
-    """Expected behaviour: where walks correct it, light from all around and on surfaces; suns are asked of the model that was chosen."""
+    """Expected behaviour: where walks correct it and are not too long; suns are asked of the model that was chosen."""
     for name in ("_BEAMS", "_BEAMS_THROWN", "_BEAMS_BACK"):
         monkeypatch.setattr(frame, name, 1)
     floor = (
@@ -298,9 +306,7 @@ def test_light_from_all_around_is_asked_of_the_quick_model(
     )
     scene.write_text(scene.read_text().replace("</scene>", floor))
     monkeypatch.setattr(frame, "_BRIGHT", 2.0)
+    monkeypatch.setattr(frame, "_LONGEST", longest)
     found = load(scene, model=model).render(1, seed=3, correct=correct).statistics.sources
-    assert {name: source["model"] for name, source in found.items()} == {
-        "suns": model or "accurate",
-        "light from all around": around,
-        "light on surfaces": around,
-    }
+    assert {name: source["model"] for name, source in found.items()} == {"suns": model or "accurate", **expected}
+    assert all((source["queries"] == 0) == (source["model"] == "") for source in found.values())
