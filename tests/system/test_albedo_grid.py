@@ -104,7 +104,7 @@ def test_a_corrected_image_asks_the_network_and_is_that_of_paths(tmp_path: Path)
       </medium></shape></scene>""")
     renderer = load(scene)
     halves = [renderer.render(2000, seed=s) for s in (1, 2)]
-    image, alone = (renderer.render(error=0.02, seed=3, **{how: True}) for how in ("correct", "audit"))
+    image, alone = (renderer.render(error=0.02, seed=3, correct=correct, audit=not correct) for correct in (True, False))
     assert [r.statistics.mode for r in (*halves, image, alone)] == ["path-traced"] * 2 + ["fast", "path-traced"]
     assert image.statistics.audit["corrected"]
     assert image.counts.queries > 0
