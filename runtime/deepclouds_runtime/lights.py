@@ -147,6 +147,7 @@ class Environment:
         self._column_sums = types.Float(by_column.ravel())
         self._edges = types.Float(edges.astype(np.float32))
         self._shape = rows, columns
+        self._bright_parts: dict[float, BrightPart | None] = {}
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance past the surfaces; see `LightSource`."""
@@ -217,6 +218,11 @@ class Environment:
 
     def bright_part(self, times: float) -> BrightPart | None:
         """The directions that are so many times brighter than the mean of all around, or None where there are none."""
+        if times not in self._bright_parts:
+            self._bright_parts[times] = self._part(times)
+        return self._bright_parts[times]
+
+    def _part(self, times: float) -> BrightPart | None:
         rows, columns = self._shape
         edges = np.cos(np.linspace(0, np.pi, rows + 1))
         power = luminance(self._colours) * (edges[:-1] - edges[1:])[:, None]

@@ -248,15 +248,11 @@ class Renderer:
             )
         started = time.perf_counter()
         watch = Watch(progress, partial, interrupted, estimate)
-        scattering = None
-        if scene.max_depth != 2:
-            scattering = self._network
         adaptive = self.mode == "fast"
-        # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
         walks = self._walks or (self._albedo is not None and not correct and scene.max_depth != 2)
         paths = Paths(self._field, scene.albedo, scene.phase, self._albedo, seed) if walks else None
-        if walks:
-            scattering = None
+        scattering = None if walks else self._network
+        # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
         sampled = adaptive and (paths is not None or (scattering is not None and self._exact_orders > 1))
         most = self.samples(spp) if spp is not None or not adaptive or (walks and not self.unbiased) else _MOST_AUTOMATIC
         if spp is None and self.unbiased:

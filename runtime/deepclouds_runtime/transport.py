@@ -67,7 +67,7 @@ class Cloud:
         orders of scattering that are sampled before `scattering` is asked: with 1 it is asked at the first collision of a ray, with 2 at
         the second one, and so on.
     varying
-        the albedo, where it varies in space; then there is no `scattering`.
+        the albedo, where it varies in space. `scattering` knows one a query: it is asked for what is interpolated alone.
     paths
         in place of `scattering`, all of J by path tracing: lights, points and directions (Array3f) -> (n, channels).
     """

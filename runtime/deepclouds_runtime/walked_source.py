@@ -14,7 +14,7 @@ import numpy as np
 from deepclouds_runtime.frame_source import FrameSource, Seen, Sees, interpolated
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.octree import Array
-from deepclouds_runtime.scattering import NetworkScattering
+from deepclouds_runtime.scattering import NetworkScattering, Stopped
 from deepclouds_runtime.transport import Cloud
 
 # Noise of a node's J that its walks are for, over the mean, and the fewest and the most of them.
@@ -49,7 +49,7 @@ def walked_source(
     cloud, eyes, seen, root, tolerance, combine, every
         see `deepclouds_runtime.frame_source.frame_source`.
     network
-        has the unit of length; it is not asked.
+        has the unit of length, and knows whether to give up, by `Stopped`; it is not asked.
     walks
         estimate J.
     most
@@ -59,7 +59,7 @@ def walked_source(
     """
     if not any(cloud.albedo) or not len(seen.points) or network.descriptor.empty:
         return None
-    found = _Walked(walks, eyes, len(cloud.albedo), network.knows_errors, combine, seed)
+    found = _Walked(walks, eyes, len(cloud.albedo), network, combine, seed)
     if len(eyes) == 1:
         found.choose(seen)
     nodes, checks = most // (found.each * len(eyes)), max(_LEAST_CHECKS, _CHECKS // len(eyes))
@@ -70,13 +70,19 @@ class _Walked:
     """What the octree interpolates: J of each colour channel, means of walks."""
 
     def __init__(
-        self, walks: LightWalks, eyes: Sequence[Sees], channels: int, errors: bool, combine: Callable[[Array], Array], seed: int
+        self,
+        walks: LightWalks,
+        eyes: Sequence[Sees],
+        channels: int,
+        network: NetworkScattering,
+        combine: Callable[[Array], Array],
+        seed: int,
     ) -> None:
-        self._walks, self._eyes, self._combine = walks, eyes, combine
+        self._walks, self._eyes, self._network, self._combine = walks, eyes, network, combine
         self._random = np.random.default_rng([seed & 0xFFFFFFFF, 0x3C1D])
         self.mix: Array = np.eye(channels)
         # What one eye sees is looked at itself; of several, only mixtures are.
-        self.carried = 2 if errors and len(eyes) == 1 else 0
+        self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
         self.queries, self.model, self.each = 0, "", _TRIALS if len(eyes) == 1 else _EACH_EYE
 
     def choose(self, seen: Seen) -> None:
@@ -104,6 +110,8 @@ class _Walked:
         n, each, channels = len(points), self.each, len(self.mix)
         mean, variance = np.zeros((n, channels)), np.zeros((n, channels))
         for start in range(0, n, max(1, _AT_ONCE // each)):
+            if self._network.stop is not None and self._network.stop():
+                raise Stopped
             part = points[start : start + max(1, _AT_ONCE // each)]
             j = self._walks(np.repeat(part, each, axis=0), np.repeat(eye.toward(part), each, axis=0), self._random)
             j = j.reshape(len(part), each, channels)

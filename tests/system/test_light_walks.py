@@ -16,7 +16,7 @@ from deepclouds_runtime._mitsuba import types_of
 from deepclouds_runtime.frame_source import Seen, upload
 from deepclouds_runtime.light_walks import BRIGHT, LightWalks, Paths
 from deepclouds_runtime.lights import Environment, Shade
-from deepclouds_runtime.scattering import NetworkScattering
+from deepclouds_runtime.scattering import NetworkScattering, Stopped
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.transport import Cloud, Lights
 from deepclouds_runtime.walked_source import walked_source
@@ -192,5 +192,8 @@ def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
     again = walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
     assert again is not None
     assert again.statistics == source.statistics
+    network.stop = lambda: True
+    with pytest.raises(Stopped):
+        walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
     black = walked_source(Cloud(cloud.field, (0.0, 0.0, 0.0), PHASE, None), network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
     assert black is None
