@@ -134,7 +134,12 @@ def test_light_on_surfaces_is_that_of_paths_and_corrected_by_a_factor(floor: Pat
     # Sixteen samples a pixel know a quarter of the floor, with the edge of the shadow in it, to a percent.
     many = rendered(floor, monkeypatch, "none", spp=256)
     np.testing.assert_allclose(_on_floor(many), _on_floor(paths), rtol=0.02)
-    # What harmonics and nodes err is corrected too, whether the network is right or not.
+    # Walks at nodes know what the floor sends without the network: what that errs in the sun's light is corrected.
+    for kind in ("none", "constant"):
+        walked = rendered(floor, monkeypatch, kind, correct=True, spp=256)
+        np.testing.assert_allclose(_on_floor(walked), _on_floor(paths), rtol=0.02)
+    # What harmonics and nodes err is corrected too, whether the network is right or not; here it is asked for all light.
+    monkeypatch.setattr(frame, "_LONGEST", 0.0)
     right, constant = (rendered(floor, monkeypatch, kind, correct=True) for kind in ("none", "constant"))
     ours, theirs = (image.statistics.audit["thrown"] for image in (right, constant))
     for a, b, deviation in zip(ours["factor"], theirs["factor"], theirs["deviation"], strict=True):
