@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import time
 from collections.abc import Callable
@@ -247,6 +248,9 @@ class Renderer:
                 f"exact orders = {self._exact_orders}: the network is audited and corrected with 1 only; leave one of the two out"
             )
         started = time.perf_counter()
+        # Shapes of scenes that nobody holds any more are among those that a kernel may call. Collected while one is traced, they leave it
+        # with two kinds of calls of one function, which Dr.Jit 1.5 then defines twice, and LLVM aborts.
+        gc.collect()
         watch = Watch(progress, partial, interrupted, estimate)
         adaptive = self.mode == "fast"
         walks = self._walks or (self._albedo is not None and not correct and scene.max_depth != 2)
