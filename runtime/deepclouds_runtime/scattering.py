@@ -137,7 +137,7 @@ class NetworkScattering:
             for k, level in enumerate(self.descriptor.levels(*part)):
                 stencil[:, k] = level.numpy().reshape(-1, POINTS)
             for m, albedo in enumerate(albedos):
-                own = albedo if isinstance(albedo, float) else albedo[start:stop]
+                own = albedo[start:stop] if isinstance(albedo, np.ndarray) else albedo
                 aux = aux_inputs(gamma[start:stop], *ordered_lobes(phase), own, depth[start:stop])
                 result[start:stop, m] = j = self.predictor.predict(stencil, aux)
                 if errors is not None:
