@@ -169,7 +169,8 @@ def test_a_turntable_keeps_the_cloud_in_the_picture(folder: Path) -> None:
     for image in images:
         opacity = image["volume_opacity"]
         assert opacity.max() > 0.9
-        assert max(opacity[0].max(), opacity[-1].max(), opacity[:, 0].max(), opacity[:, -1].max()) == 0
+        # What is thinner than a small share of the densest voxel is not framed (`volume_scene._FRAMED`), and may be met at an edge.
+        assert max(opacity[0].max(), opacity[-1].max(), opacity[:, 0].max(), opacity[:, -1].max()) < 1e-4
     assert not np.allclose(images[0]["R"], images[1]["R"], rtol=0.1)
 
 
