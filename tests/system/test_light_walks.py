@@ -80,7 +80,8 @@ def by_directions(cloud: Cloud, lights: Lights, points: Floats, w: Floats, seed:
     found: list[tuple[Floats, Floats]] = [(np.tile(sun.omega_sun, (n, 1)), np.tile(sun.irradiance, (n, 1))) for sun in lights.suns]
     for source, _ in lights.sources:
         omega, density = source.sample(*(lanes_of(types.Float, rng.random(n)) for _ in range(2)))
-        light = source.arriving(upload(types, points), omega, None)  # type: ignore[arg-type]
+        assert isinstance(source, Environment)
+        light = source.seen(upload(types, points), omega)
         found.append((rows(omega), np.stack([np.array(v / density, np.float64) for v in light], axis=1)))
     white = np.broadcast_to(np.array([1.0, 0.8], np.float32), (n, 2))
     for k, (omega, irradiance) in enumerate(found):
