@@ -57,16 +57,23 @@ def lanes_of(kind: Any, values: ArrayLike) -> Any:
     """Numbers (n,) as a Dr.Jit array of the type `kind` (Float, UInt32, ...), one a lane.
 
     Dr.Jit takes the memory of a NumPy array as it is, and compiles one kernel for memory that begins at a multiple of 64 bytes and another
-    for memory that does not, for each array that a kernel reads. NumPy's memory begins anywhere: it is copied to where it suits.
+    for memory that does not, for each array that a kernel reads; from the latter it gathers number by number where packets were asked for.
+    NumPy's memory begins anywhere: it is copied to where it suits.
     """
     import drjit as dr
 
-    given = np.asarray(values, np.float32 if dr.is_float_v(kind) else np.uint32)
+    given = np.asarray(values, np.float32 if dr.is_float_v(kind) else np.int32 if dr.is_signed_v(kind) else np.uint32)
     memory = np.empty(given.nbytes + _ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % _ALIGNMENT
     aligned = memory[first : first + given.nbytes].view(given.dtype)
     aligned[:] = given
     return kind(aligned)
+
+
+def vectors_of(types: ModuleType, values: ArrayLike) -> Any:
+    """Points or vectors (n, 3) of NumPy arrays as an Array3f, one a lane: what `rows` takes back."""
+    given = np.asarray(values)
+    return types.Array3f(*(lanes_of(types.Float, given[:, c]) for c in range(3)))
 
 
 def rows(vector: Any) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepclouds.backend import lanes_of, vectors_of
 from deepclouds.descriptor._layout import FIRST_SPACING, LEVELS, POINTS
 from deepclouds.medium.field import Field
 from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, trilinear
@@ -178,8 +179,8 @@ class Descriptor:
     ) -> NDArray[np.float32]:
         """Stencils (n, 10, 225) of NumPy arrays of points and directions, each (n, 3), and azimuths and sides (n,); into `out` if given."""
         types = self.field.types
-        x, d, sun = (types.Array3f(np.ascontiguousarray(np.asarray(a, np.float32).T)) for a in (points, w, omega_sun))
-        turn, flip = (None if a is None else types.Float(np.ascontiguousarray(a, np.float32)) for a in (azimuth, side))
+        x, d, sun = (vectors_of(types, a) for a in (points, w, omega_sun))
+        turn, flip = (None if a is None else lanes_of(types.Float, a) for a in (azimuth, side))
         n = len(np.asarray(points))
         result = np.empty((n, LEVELS, POINTS), np.float32) if out is None else out
         for k, level in enumerate(self.levels(x, d, sun, turn, flip)):

@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of, rows
+from deepclouds.backend import rows, vectors_of
 from deepclouds.medium.field import Field
 
 
@@ -41,8 +41,7 @@ def first_collisions(
     n = len(origins)
     if n == 0 or field.majorant == 0.0:
         return np.array(origins, np.float32), np.zeros(n, np.bool_)
-    o = types.Array3f(*(lanes_of(types.Float, origins[:, c]) for c in range(3)))
-    d = types.Array3f(*(lanes_of(types.Float, directions[:, c]) for c in range(3)))
+    o, d = vectors_of(types, origins), vectors_of(types, directions)
     key = dr.opaque(types.UInt64, int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
     distance, hit = _track(field, o, d, types.PCG32(n, initstate=key))
     points = dr.fma(d, dr.select(hit, distance, 0), o)

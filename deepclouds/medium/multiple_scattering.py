@@ -16,6 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of
 from deepclouds.medium.field import Field
 from deepclouds.medium.phase import as_lobes, hg, rotate_to, sample_hg_cosine, sample_two_lobe_cosine, two_lobe
 
@@ -96,7 +97,7 @@ class _Queries:
 
     def __init__(self, types: Any, points: Any, directions: Any, lobes: Any, suns: Any, albedos: Any) -> None:
         def upload(values: Any) -> Any:
-            return types.Float(np.ascontiguousarray(values, np.float32))
+            return lanes_of(types.Float, values)
 
         self.points = [upload(points[:, c]) for c in range(3)]
         self.directions = [upload(directions[:, c]) for c in range(3)]

@@ -17,9 +17,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import vectors_of
 from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.correction import FLOOR
-from deepclouds_runtime.frame_source import Arriving, Seen, frame_source, upload
+from deepclouds_runtime.frame_source import Arriving, Seen, frame_source
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import on_host
 from deepclouds_runtime.scattering import NetworkScattering
@@ -131,7 +132,7 @@ class AllRound:
         points, along, weights = self.seen.points, self.along, self.seen.weights * self.counts
         if not self.sources or not weights.sum() > 0:
             return {}
-        x, w = upload(self._types, points), upload(self._types, along)
+        x, w = vectors_of(self._types, points), vectors_of(self._types, along)
         predicted = on_host(self(x, w), len(points))
         level = predicted.mean(axis=1)
         wanted = weights * (level + max(FLOOR * float(np.average(level, weights=weights)), 1e-30))

@@ -9,10 +9,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from deepclouds.backend import lanes_of, rows
+from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds_runtime import stratified
 from deepclouds_runtime.correction import FLOOR
-from deepclouds_runtime.frame_source import FrameSource, seen_by, upload
+from deepclouds_runtime.frame_source import FrameSource, seen_by
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import on_host
 from deepclouds_runtime.octree import Array
@@ -114,7 +114,7 @@ class Walks:
 def predicted_at(sources: Sequence[FrameSource], points: Array) -> Array:
     """J (n, channels) of all sources at world points (n, 3)."""
     types = sources[0].octree.types
-    x = upload(types, points)
+    x = vectors_of(types, points)
     totals: list[Any] | None = None
     for source in sources:
         values = source.colours(source.octree.lookup(source.octree.to_local(x), types.Bool(True)))

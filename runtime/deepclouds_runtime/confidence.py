@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of
+from deepclouds.backend import vectors_of
 from deepclouds_runtime.frame_source import FrameSource, Seen
 
 Image = NDArray[np.float32]
@@ -44,7 +44,7 @@ def relative_errors(sources: Sequence[FrameSource], seen: Seen, pixels: NDArray[
     for source in sources:
         octree: Any = source.doubt
         types = octree.types
-        points = types.Array3f(*(lanes_of(types.Float, seen.points[:, c]) for c in range(3)))
+        points = vectors_of(types, seen.points)
         for field, value in zip(light, octree.lookup(octree.to_local(points), types.Bool(True)), strict=True):
             of_ray = np.bincount(seen.rays, seen.weights * np.array(value, np.float64), len(pixels))
             field += of_ray.reshape(field.shape)

@@ -10,6 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from deepclouds.backend import lanes_of
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.lights import Shade, mitsuba_radiance
 from deepclouds_runtime.scene_lights import Sun
@@ -47,7 +48,7 @@ class Disc:
         self._sine = dr.opaque(types.Float, math.sin(sun.radius))
         self._density = dr.opaque(types.Float, 1 / (2 * math.pi * height))
         self._radiance = [dr.opaque(types.Float, v / (math.pi * math.sin(sun.radius) ** 2)) for v in sun.irradiance]
-        self._limb = [types.Float(np.array(ring, np.float32)) for ring in zip(*sun.limb, strict=True)]
+        self._limb = [lanes_of(types.Float, ring) for ring in zip(*sun.limb, strict=True)]
         self._rings = len(sun.limb)
 
     def sample(self, u: Any, v: Any) -> tuple[Any, Any]:

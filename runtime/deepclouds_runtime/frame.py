@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of
+from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
@@ -175,7 +175,7 @@ class Frame:
         origin, direction, _ = self.camera.rays(pixel, numbers)
         # What the camera sees of the surfaces, and what the middle of the cloud sees of them: the probe stands there.
         around = spread(_PILOT // 8).astype(np.float32)
-        out = types.Array3f(*(lanes_of(types.Float, around[:, c]) for c in range(3)))
+        out = vectors_of(types, around)
         parts = []
         for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
             _, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
@@ -190,7 +190,7 @@ class Frame:
             )
             ahead = aims - places
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
-            o, d = (types.Array3f(*(lanes_of(types.Float, v[:, c]) for c in range(3))) for v in (places, ahead))
+            o, d = (vectors_of(types, v) for v in (places, ahead))
             end = dr.full(types.Float, math.inf, len(places))
             seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
             # Light on what the camera sees counts in the image, by the cloud's size as seen from there.

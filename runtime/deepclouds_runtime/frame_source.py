@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of, rows
+from deepclouds.backend import rows, vectors_of
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds_runtime.lights import Beam, LightSource, Shade, on_host
@@ -390,9 +390,9 @@ class _Predicted:
 
     def _add(self, points: Array, pairs: Sequence[tuple[int, Arriving]], total: Array, error: Array) -> None:
         types, field, n = self._cloud.field.types, self._cloud.field, len(points)
-        x = upload(types, np.tile(points, (len(pairs), 1)))
-        d = upload(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
-        omega = upload(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
+        x = vectors_of(types, np.tile(points, (len(pairs), 1)))
+        d = vectors_of(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
+        omega = vectors_of(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
         tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Bool(True), _DEEP)
         dr.eval(tau)
         albedos, columns, square = self._at(points, len(pairs))
@@ -401,7 +401,7 @@ class _Predicted:
         self.queries += j.size
         errors = np.zeros_like(j) if errors is None else errors
         j, errors = (v[:, columns].reshape(len(pairs), n, -1) * square for v in (j, errors))
-        x = upload(types, points)
+        x = vectors_of(types, points)
         for (e, light), values, expected in zip(pairs, j, errors, strict=True):
             arriving = light.at(x)
             dr.eval(arriving)
@@ -421,9 +421,9 @@ class _Predicted:
         if varying is None:
             return self._albedos, list(range(len(self._albedos))), np.ones(1)
         types, n = field.types, len(points)
-        own = on_host(self._cloud.albedo_at(upload(types, points)), n)
+        own = on_host(self._cloud.albedo_at(vectors_of(types, points)), n)
         around = np.random.default_rng(_AROUND).normal(size=(_AROUND, 3)) * (_REACH * self._network.descriptor.unit)
-        places = upload(types, (points[:, None] + around).reshape(-1, 3))
+        places = vectors_of(types, (points[:, None] + around).reshape(-1, 3))
         sigma = np.array(field.sigma_t(places), np.float64).reshape(n, _AROUND, 1)
         # Where nothing is near, as if there were.
         sigma += 1e-3 * max(field.majorant, 1e-30)
@@ -436,11 +436,6 @@ class _Predicted:
             if not same:
                 albedos.append(np.clip(np.tile(mean[:, c], times), 0, 1))
         return albedos, columns, own * mean
-
-
-def upload(types: Any, values: Array) -> Any:
-    """Points (n, 3) on the device, as Array3f."""
-    return types.Array3f(*(lanes_of(types.Float, values[:, c]) for c in range(3)))
 
 
 def _tint(lights: Sequence[Arriving]) -> Array | None:
@@ -471,7 +466,7 @@ def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: See
     if not len(checks.points):
         return 1.0, 0.0
     true = evaluate(checks.points)[:, : octree.fields].astype(np.float64)[:, ::every]
-    values = octree.lookup(octree.to_local(upload(octree.types, checks.points)), octree.types.Bool(True))
+    values = octree.lookup(octree.to_local(vectors_of(octree.types, checks.points)), octree.types.Bool(True))
     dr.eval(values)
     interpolated = np.stack([np.array(v, np.float64) for v in values[::every]], axis=1)
     if not (true.sum() > 0 and interpolated.sum() > 0):

@@ -8,11 +8,10 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
-from deepclouds.backend import lanes_of, rows
+from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.medium.one_sun import Escapes, trace_to_escape
-from deepclouds_runtime.frame_source import upload
 from deepclouds_runtime.lights import BrightPart, Environment, LightSource, Shade, on_host
 from deepclouds_runtime.octree import Array
 from deepclouds_runtime.scene_lights import Sun
@@ -76,7 +75,7 @@ class LightWalks:
     def _of_one(self, points: Array, along: Array, light: _Connected | None, share: float, key: int, random: np.random.Generator) -> Array:
         """J (n, channels) of walks that are connected to `light`, a `share` of all."""
         cloud, types, n = self._cloud, self._cloud.field.types, len(points)
-        own = on_host(cloud.albedo_at(upload(types, points)), n)
+        own = on_host(cloud.albedo_at(vectors_of(types, points)), n)
         if cloud.varying is None:
             albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
             # Which of them each channel has; a black one has any.
@@ -117,7 +116,7 @@ class LightWalks:
         direction, where = take(escapes.direction), np.array(lanes)
         m = self._cloud.field.volume.to_world
         unit = rows(take(escapes.position)).astype(np.float64)
-        x = upload(types, unit @ m[:3, :3].T + m[:3, 3])
+        x = vectors_of(types, unit @ m[:3, :3].T + m[:3, 3])
         one = dr.opaque(types.UInt32, 1)
         total = np.zeros((len(lanes), channels))
         for number, (source, _) in enumerate(self._lights.sources):
@@ -197,7 +196,7 @@ class _OfSun:
     def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
         n = len(points)
         omega = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in self._sun.omega_sun))
-        visible = np.broadcast_to(np.array(self._shade.visible(upload(types, points), omega)), n)
+        visible = np.broadcast_to(np.array(self._shade.visible(vectors_of(types, points), omega)), n)
         toward = np.broadcast_to(np.array(self._sun.omega_sun, np.float32), (n, 3))
         return toward, visible[:, None] * np.array(self._sun.irradiance, np.float64)
 
@@ -213,6 +212,6 @@ class _OfBright:
         u, v = (np.minimum((np.argsort(random.random(n)) + random.random(n)) / n, 1 - 1e-7) for _ in range(2))
         omega, density = self.part.light.sample(*(lanes_of(types.Float, t) for t in (u, v)))
         # A direction at a cell's edge may fall into the next one, which escapes see.
-        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.seen(upload(types, points), omega)]
+        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.seen(vectors_of(types, points), omega)]
         dr.eval(omega, light)
         return np.broadcast_to(rows(omega), (n, 3)), on_host(light, n)

@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
 from deepclouds_runtime.stratified import Stratified
 
@@ -143,9 +144,9 @@ class Environment:
         # Cumulative sums a row and a column keep their digits where one sum over all cells would not.
         by_row = _cumulative(weight.sum(axis=1)[None])[0]
         by_column = _cumulative(weight)
-        self._row_sums = types.Float(by_row.ravel())
-        self._column_sums = types.Float(by_column.ravel())
-        self._edges = types.Float(edges.astype(np.float32))
+        self._row_sums = lanes_of(types.Float, by_row.ravel())
+        self._column_sums = lanes_of(types.Float, by_column.ravel())
+        self._edges = lanes_of(types.Float, edges)
         self._shape = rows, columns
         self._bright_parts: dict[float, BrightPart | None] = {}
 
@@ -233,7 +234,7 @@ class Environment:
         colours = np.where(bright[..., None], self._colours, 0)
         alone = Environment(self.types, self.radiance, colours, self._frame, self._shade, uniform=0.0)
         irradiance = (self._colours * bright[..., None] * (edges[:-1] - edges[1:])[:, None, None]).sum(axis=(0, 1)) * (2 * np.pi / columns)
-        return BrightPart(alone, self.types.Float(bright.astype(np.float32).ravel()), float(irradiance.max()))
+        return BrightPart(alone, lanes_of(self.types.Float, bright.ravel()), float(irradiance.max()))
 
     def lookup(self, table: Any, direction: Any) -> Any:
         """Values of `table`, one float a cell of the grid, row by row, in the cells that these directions fall into."""
@@ -420,8 +421,8 @@ def _table(
     total: Any = 0
     for part in np.ndindex(parts, parts):
         local = directions_of_cells(rows, columns, ((part[0] + 0.5) / parts, (part[1] + 0.5) / parts))
-        world = (local.reshape(-1, 3) @ frame.T).astype(np.float32)
-        values = radiance(types.Array3f(*(types.Float(np.ascontiguousarray(world[:, c])) for c in range(3))))
+        world = local.reshape(-1, 3) @ frame.T
+        values = radiance(vectors_of(types, world))
         total = total + on_host(values, len(world)).reshape(rows, columns, -1)
     result: NDArray[np.float64] = total / parts**2
     return result

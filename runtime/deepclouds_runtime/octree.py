@@ -16,6 +16,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of
+
 Array = NDArray[Any]
 # Corners of the unit cube, x fastest.
 _CORNERS = np.array([(i & 1, (i >> 1) & 1, (i >> 2) & 1) for i in range(8)], np.int64)
@@ -330,8 +332,8 @@ class DeviceOctree:
 
     def __init__(self, types: Any, lattice: Lattice, table: Array, leaves: Array) -> None:
         self.types, self.fields = types, leaves.shape[2]
-        self._table = types.Int32(table)
-        self._leaves = [types.Float(np.ascontiguousarray(leaves[:, :, k]).ravel()) for k in range(self.fields)]
+        self._table = lanes_of(types.Int32, table)
+        self._leaves = [lanes_of(types.Float, leaves[:, :, k].ravel()) for k in range(self.fields)]
         turn = lattice.axes.T / lattice.spacing
         self._turn = [[dr.opaque(types.Float, float(v)) for v in row] for row in turn]
         self._shift = [dr.opaque(types.Float, float(v)) for v in -turn @ lattice.origin]

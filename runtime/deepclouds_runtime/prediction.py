@@ -6,7 +6,7 @@ import logging
 import math
 from functools import lru_cache
 from os import PathLike, fspath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,6 +77,7 @@ def predict(
         when shapes do not fit.
     """
     from deepclouds.backend import backend as types_named
+    from deepclouds.backend import vectors_of
     from deepclouds.medium.field import Field
     from deepclouds.medium.optical_depth import optical_depth
     from deepclouds.model import multiple_scattering
@@ -91,11 +92,8 @@ def predict(
         return np.zeros(len(x))
     types = types_named(backend)
 
-    def upload(values: NDArray[np.float32]) -> Any:
-        return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c])) for c in range(3)))
-
     field = Field(types, volume, scale)
-    p, d, s = upload(x), upload(w), upload(suns)
+    p, d, s = vectors_of(types, x), vectors_of(types, w), vectors_of(types, suns)
     tau = optical_depth(field, p, s, types.Float(0), types.Float(math.inf), types.Bool(True), float("inf"))
     if predictor is None:
         name = None if model is None else fspath(model)

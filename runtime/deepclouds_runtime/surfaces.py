@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of, vectors_of
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.medium.phase import rotate_to
 from deepclouds_runtime import stratified
@@ -178,7 +179,7 @@ class Reflectors:
         self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
         colours, thrown = self._probe(seed, counts)
         self._table = Environment(self._types, self._nothing, colours, uniform=_PROBE_UNIFORM)
-        self._thrown = [self._types.Float(np.ascontiguousarray(thrown[:, c], np.float32)) for c in range(thrown.shape[1])]
+        self._thrown = [lanes_of(self._types.Float, thrown[:, c]) for c in range(thrown.shape[1])]
         self.sample, self.density, self.beams = self._table.sample, self._table.density, self._table.beams
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
@@ -213,8 +214,8 @@ class Reflectors:
         colours, thrown = np.zeros((n, len(self._cloud.albedo))), np.zeros((n, len(self._cloud.albedo)))
         for part in range(_PROBE_PARTS):
             place = random.random(2)
-            local = directions_of_cells(rows, columns, (float(place[0]), float(place[1]))).reshape(-1, 3).astype(np.float32)
-            direction = types.Array3f(*(types.Float(np.ascontiguousarray(local[:, c])) for c in range(3)))
+            local = directions_of_cells(rows, columns, (float(place[0]), float(place[1]))).reshape(-1, 3)
+            direction = vectors_of(types, local)
             numbers = Stratified(
                 types,
                 dr.arange(types.UInt32, n),

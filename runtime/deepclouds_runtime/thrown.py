@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of
+from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime.result import Image
 
 # Pixels that are averaged lie so many apart at most, and on the surface no further than this share of the distance to the cloud's box.
@@ -74,7 +74,7 @@ class ThrownLight:
             return self._light
         mean = self._place / np.maximum(self._count, 1)[:, None]
         light, share = ([lanes_of(types.Float, a[:, c]) for c in range(3)] for a in (self._light, self._share))
-        place, normal = (types.Array3f(*(lanes_of(types.Float, a[:, c]) for c in range(3))) for a in (mean, self._normal))
+        place, normal = (vectors_of(types, a) for a in (mean, self._normal))
         lower, upper = (types.Array3f(*(dr.opaque(types.Float, float(v)) for v in corner)) for corner in self._bounds)
         matt = types.Bool(self._count > 0)
         columns, rows = dr.opaque(types.UInt32, width), dr.opaque(types.UInt32, height)

@@ -75,21 +75,19 @@ def kernel_aux(types: ModuleType, vectors: Vectors) -> tuple[NDArray[np.float32]
     """The input `aux` (n, 6) as the renderer makes it from the stored tau, and tau (n,) by the renderer's own sum over cells."""
     import drjit as dr
 
+    from deepclouds.backend import vectors_of
     from deepclouds.medium.field import Field
     from deepclouds.medium.optical_depth import optical_depth
     from deepclouds.model import aux_inputs
 
-    def upload(values: NDArray[np.float32]) -> Any:
-        return types.Array3f(*(types.Float(np.ascontiguousarray(values[:, c])) for c in range(3)))
-
     rows = vectors.queries
-    w, sun = upload(rows[:, 3:6]), upload(rows[:, 6:9])
+    w, sun = vectors_of(types, rows[:, 3:6]), vectors_of(types, rows[:, 6:9])
     gamma = np.array(dr.atan2(dr.norm(dr.cross(w, sun)), dr.dot(w, sun)))
     depths = []
     for medium in vectors.media:
         part = _rows(vectors, medium)
         field, zero = Field(types, vectors.volume, medium.scale), types.Float(0)
-        points, toward = upload(part[:, 0:3]), upload(part[:, 6:9])
+        points, toward = vectors_of(types, part[:, 0:3]), vectors_of(types, part[:, 6:9])
         tau = optical_depth(field, points, toward, zero, types.Float(math.inf), types.Bool(True), math.inf)
         depths.append(np.array(tau))
     return aux_inputs(gamma, *(rows[:, c] for c in range(9, 14))), np.concatenate(depths)

@@ -22,10 +22,10 @@ from deepclouds.backend import backend, lanes_of, rows
 from tests.system.smooth_network import Smooth
 
 CLOUD = Path(deepclouds_runtime.__file__).parent / "data" / "demo.vdb"
-# Rays of the pilot, of the image, and of the audit's walks (two counts).
-CAMERA_KERNELS = 4
-# Renders of each kind: Dr.Jit puts the operations of a kernel into another order now and then, but not each time.
-TRIES = 4
+# Rays of the pilot, of the image, and of the audit's walks.
+CAMERA_KERNELS = 3
+# Renders of each kind: memory, which kernels differ by, lies in other places in each.
+TRIES = 3
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +45,7 @@ def kernels(render: Callable[[], object]) -> set[str]:
 
 def test_constants_are_found_out() -> None:
     """What is counted does see a number that is baked in; numbers of lanes, and where their memory begins, are none."""
+    octave = np.arange(80, dtype=np.float32)
     types = backend()
 
     def baked(n: int) -> None:
@@ -55,6 +56,8 @@ def test_constants_are_found_out() -> None:
         for extra in range(6):
             value = lanes_of(types.Float, np.arange(n + extra)[extra:])
             rows(types.Array3f(value, 2 * value, 3 * value + 0.789))
+            table = lanes_of(types.Float, octave[extra : extra + 64])
+            dr.eval(dr.gather(types.ArrayXf, table, dr.arange(types.UInt32, 8), shape=(8, 8)))
 
     assert len(kernels(lambda: baked(4)) - kernels(lambda: baked(3))) == 1
     assert kernels(lambda: points(20)) == kernels(lambda: points(11))
@@ -62,7 +65,6 @@ def test_constants_are_found_out() -> None:
 
 @pytest.mark.parametrize("sky", [0.0, 0.3], ids=["sun", "sun and sky"])
 def test_another_view_and_other_counts_compile_camera_rays_alone(sky: float) -> None:
-    """A constant is compiled anew in every render; what Dr.Jit orders in another way now and then is not new in all of several."""
     first, *others = (load(CLOUD, predictor=Smooth(), size=(24, 18), sky=sky, view=(40.0 * i, 5.0 + 5 * i)) for i in range(TRIES + 1))
     # An error that is easily reached takes few walks.
     known = kernels(lambda: first.render(8, seed=1, error=0.25, correct=True))
@@ -80,6 +82,7 @@ def test_another_view_and_other_counts_compile_camera_rays_alone(sky: float) -> 
         new(partial(first.render, 5 - i, seed=2 + i, error=0.2 + 0.01 * i, correct=True), counts)
         new(partial(other.render, 3 + i, seed=12 + i, error=0.3 - 0.01 * i, correct=True), views)
         new(partial(other.render, seed=22 + i, error=0.1 + 0.01 * i), dialled)
-    assert min(counts) == 0, counts
-    assert min(views) <= CAMERA_KERNELS, views
-    assert min(dialled) == 0, dialled
+    assert counts == [0] * TRIES
+    assert max(views) <= CAMERA_KERNELS, views
+    # The dial looks up other fields than an image with a fixed number of samples.
+    assert dialled[0] <= 1 and not any(dialled[1:]), dialled

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from deepclouds_runtime._mitsuba import types_of
-from deepclouds_runtime.frame_source import Seen, upload
+from deepclouds_runtime.frame_source import Seen
 from deepclouds_runtime.light_walks import BRIGHT, LightWalks, Paths
 from deepclouds_runtime.lights import Environment, Shade
 from deepclouds_runtime.scattering import NetworkScattering, Stopped
@@ -23,7 +23,7 @@ from deepclouds_runtime.walked_source import walked_source
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from deepclouds.backend import lanes_of, rows
+from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds.medium.field import Field
 from deepclouds.medium.one_sun import trace_one_sun
 from deepclouds.volume import Volume
@@ -81,7 +81,7 @@ def by_directions(cloud: Cloud, lights: Lights, points: Floats, w: Floats, seed:
     for source, _ in lights.sources:
         omega, density = source.sample(*(lanes_of(types.Float, rng.random(n)) for _ in range(2)))
         assert isinstance(source, Environment)
-        light = source.seen(upload(types, points), omega)
+        light = source.seen(vectors_of(types, points), omega)
         found.append((rows(omega), np.stack([np.array(v / density, np.float64) for v in light], axis=1)))
     white = np.broadcast_to(np.array([1.0, 0.8], np.float32), (n, 2))
     for k, (omega, irradiance) in enumerate(found):
@@ -113,7 +113,7 @@ def test_j_is_that_of_walks_to_one_direction_of_each_light(types: Any, sun_count
         assert np.all(a.var(axis=1).mean(axis=0) < 0.5 * b.var(axis=1).mean(axis=0))
     # The same for an image, where every call has its own random numbers.
     paths = Paths(cloud.field, ALBEDO, PHASE, None, 55)
-    first, second = (paths(lights, upload(types, points), upload(types, w)) for _ in range(2))
+    first, second = (paths(lights, vectors_of(types, points), vectors_of(types, w)) for _ in range(2))
     assert not np.array_equal(first, second)
     a = first[:, :2].reshape(n, each, 2)
     assert np.all(np.abs(a.mean(axis=(0, 1)) - mean) < 3.5 * np.sqrt((b.var(axis=1) + a.var(axis=1)).sum(axis=0) / each) / n)
@@ -128,7 +128,7 @@ def test_what_is_bright_is_cut_out_and_stands_for_its_light(types: Any) -> None:
     d = rng.normal(size=(4000, 3))
     d[:1000] = SPOTS[rng.integers(0, 2, 1000)] + 0.05 * d[:1000]
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    inside = np.array(part.holds(upload(types, d)))
+    inside = np.array(part.holds(vectors_of(types, d)))
     far = (d @ SPOTS.T).max(axis=1)
     assert inside[far > 0.997].all()
     assert not inside[far < 0.97].any()
@@ -176,7 +176,7 @@ def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
     assert source.queries == 0
     assert source.statistics.nodes > 50
     some = points[:400]
-    values = source.colours(source.octree.lookup(source.octree.to_local(upload(types, some)), types.Bool(True)))
+    values = source.colours(source.octree.lookup(source.octree.to_local(vectors_of(types, some)), types.Bool(True)))
     j = np.stack([np.broadcast_to(np.array(v), len(some)) for v in values], axis=1)
     each = 600
     repeated = np.repeat(some, each, axis=0)

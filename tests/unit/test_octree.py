@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -14,7 +13,7 @@ from deepclouds_runtime.march import depths, gathered
 from deepclouds_runtime.octree import Lattice, Octree, lattice_around, root_nodes
 from numpy.typing import NDArray
 
-from deepclouds.backend import backend
+from deepclouds.backend import backend, vectors_of
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.volume import Volume
@@ -34,13 +33,9 @@ def _lattice(spacing: float) -> Lattice:
     return lattice_around(BOX, CORNER, TURN, spacing)
 
 
-def _upload(values: NDArray[np.float64]) -> Any:
-    return types.Array3f(np.ascontiguousarray(values.T, np.float32))
-
-
 def _lookup(octree: Octree, points: NDArray[np.float64]) -> NDArray[np.float64]:
     device = octree.upload(types)
-    return np.array([np.array(v) for v in device.lookup(device.to_local(_upload(points)), types.Bool(True))], np.float64).T
+    return np.array([np.array(v) for v in device.lookup(device.to_local(vectors_of(types, points)), types.Bool(True))], np.float64).T
 
 
 def _bump(points: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -130,13 +125,13 @@ def test_a_change_between_the_nodes_arrives_there() -> None:
         return result
 
     device = octree.changed(types, waves, points, np.ones(len(points)))
-    found = np.array(device.lookup(device.to_local(_upload(tried)), types.Bool(True))[0], np.float64)[:, None]
+    found = np.array(device.lookup(device.to_local(vectors_of(types, tried)), types.Bool(True))[0], np.float64)[:, None]
     wanted = waves(tried, flat(tried))
     assert found.mean() == pytest.approx(wanted.mean(), rel=2e-3)
     slow = np.sin(0.7 * place.local(tried)[:, 0])
     assert np.cov(found[:, 0], slow)[0, 1] == pytest.approx(np.cov(wanted[:, 0], slow)[0, 1], rel=0.05)
     device = octree.changed(types, lambda where, values: waves(where, values) - 1.3, points, np.ones(len(points)))
-    assert min(float(np.array(v).min()) for v in device.lookup(device.to_local(_upload(tried)), types.Bool(True))) >= 0
+    assert min(float(np.array(v).min()) for v in device.lookup(device.to_local(vectors_of(types, tried)), types.Bool(True))) >= 0
 
 
 def test_a_linear_change_is_met_exactly_where_cells_of_two_sizes_meet() -> None:
@@ -144,7 +139,7 @@ def test_a_linear_change_is_met_exactly_where_cells_of_two_sizes_meet() -> None:
     octree = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), 0.02, 10**6, 4)
     before = _lookup(octree, tried)
     device = octree.changed(types, lambda where, values: values * 1.7, points, np.ones(len(points)))
-    found = np.array([np.array(v) for v in device.lookup(device.to_local(_upload(tried)), types.Bool(True))], np.float64).T
+    found = np.array([np.array(v) for v in device.lookup(device.to_local(vectors_of(types, tried)), types.Bool(True))], np.float64).T
     np.testing.assert_allclose(found, 1.7 * before, rtol=2e-4)
 
 
@@ -164,7 +159,7 @@ def test_a_source_of_one_adds_up_to_what_the_ray_hides(scale: float) -> None:
     lattice = lattice_around(np.full(3, 2.0), np.full(3, -1.0), np.eye(3), 0.5)
     points = np.random.default_rng(8).uniform(-1, 1, (500, 3))
     octree = Octree(lattice, lambda p: np.ones((len(p), 1), np.float32), points, np.ones(500), 0.1, 10**6, 1).upload(types)
-    o, d, far = _upload(origin), _upload(direction), types.Float(math.inf)
+    o, d, far = vectors_of(types, origin), vectors_of(types, direction), types.Float(math.inf)
     tau, sums = gathered(field, [octree], o, d, far, types.Float(0.6), types.Bool(True))
     whole = np.array(optical_depth(field, o, d, types.Float(0), far, types.Bool(True)))
     np.testing.assert_allclose(np.minimum(np.array(tau), 15), np.minimum(whole, 15), rtol=1e-4, atol=1e-9)
@@ -173,7 +168,7 @@ def test_a_source_of_one_adds_up_to_what_the_ray_hides(scale: float) -> None:
 
 def test_collisions_lie_in_equal_shares_of_what_is_hidden() -> None:
     field, origin, direction = _ball()
-    o, d, far = _upload(origin), _upload(direction), types.Float(math.inf)
+    o, d, far = vectors_of(types, origin), vectors_of(types, direction), types.Float(math.inf)
     whole = np.array(optical_depth(field, o, d, types.Float(0), far, types.Bool(True)), np.float64)
     hidden, count, shift = -np.expm1(-whole), 5, 0.25
     found = np.array(depths(field, o, d, far, types.Float(hidden.astype(np.float32)), types.Float(shift), count, types.Bool(True)))
@@ -200,7 +195,7 @@ def test_marches_leave_out_empty_bricks() -> None:
     origin = rng.uniform(-3, 3, (n, 3))
     direction = rng.uniform(-1, 1, (n, 3)) - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    o, d, end = _upload(origin), _upload(direction), types.Float(rng.choice([2.0, 3.0, math.inf], n))
+    o, d, end = vectors_of(types, origin), vectors_of(types, direction), types.Float(rng.choice([2.0, 3.0, math.inf], n))
     shift = types.Float(rng.random(n).astype(np.float32))
     results = []
     for brick in (None, 4):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from deepclouds.backend import backend
+from deepclouds.backend import backend, vectors_of
 from deepclouds.descriptor import Descriptor
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
@@ -47,10 +47,6 @@ def points_in(volume: Volume, n: int, seed: int) -> NDArray[np.float64]:
     unit = np.random.default_rng(seed).uniform(-0.1, 1.1, (n, 3))
     result: NDArray[np.float64] = unit @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
     return result
-
-
-def upload(values: NDArray[Any]) -> Any:
-    return types.Array3f(np.ascontiguousarray(values.T, np.float32))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -92,7 +88,7 @@ def test_lookups_are_those_of_the_dense_grid(shape: tuple[int, int, int]) -> Non
     on_faces = points_in(volume, 2000, 3)
     local = np.clip((on_faces - volume.to_world[:3, 3]) @ np.linalg.inv(volume.to_world[:3, :3]).T, 0.001, 0.999)
     points = np.concatenate([points, local @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]])
-    dense, sparse = (np.array(Field(types, v, 2.7).sigma_t(upload(points))) for v in (volume, in_bricks(volume)))
+    dense, sparse = (np.array(Field(types, v, 2.7).sigma_t(vectors_of(types, points))) for v in (volume, in_bricks(volume)))
     assert np.count_nonzero(dense) > 100
     np.testing.assert_array_equal(sparse, dense)
 
@@ -110,15 +106,15 @@ def test_majorants_bound_the_field_and_marches_agree() -> None:
     dense, sparse = Field(types, volume, 5.0), Field(types, in_bricks(volume), 5.0)
     assert sparse.majorant == dense.majorant
     points, rng = points_in(volume, 20_000, 4), np.random.default_rng(5)
-    unit = upload((points - volume.to_world[:3, 3]) @ np.linalg.inv(volume.to_world[:3, :3]).T)
+    unit = vectors_of(types, (points - volume.to_world[:3, 3]) @ np.linalg.inv(volume.to_world[:3, :3]).T)
     directions = rng.normal(size=(20_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    along = sparse.direction_to_unit(upload(directions))
+    along = sparse.direction_to_unit(vectors_of(types, directions))
     inside = sparse.holds_unit(unit)
     _, _, majorant = sparse.majorants.step(unit, along, types.Float(0), types.Float(0.5), inside)
     assert np.all(np.array(sparse.sigma_t_unit(unit, inside)) <= np.array(majorant) * (1 + 1e-6))
     assert sparse.majorants.any_empty
-    arguments = (upload(points), upload(directions), types.Float(0), types.Float(1e4), types.Bool(True))
+    arguments = (vectors_of(types, points), vectors_of(types, directions), types.Float(0), types.Float(1e4), types.Bool(True))
     a, b = (np.array(optical_depth(f, *arguments)) for f in (dense, sparse))
     assert a.max() > 1
     np.testing.assert_array_equal(b, a)
@@ -211,7 +207,7 @@ def test_bricks_that_hold_nothing() -> None:
     field = Field(types, empty, 3.0)
     assert field.majorant == 0
     points = np.random.default_rng(13).uniform(-0.2, 1.2, (100, 3))
-    assert not np.array(field.sigma_t(upload(points))).any()
+    assert not np.array(field.sigma_t(vectors_of(types, points))).any()
     assert mean_extinction(empty) == 0
     assert len(empty.row_ends(0.0)[0]) == 0
     w = np.broadcast_to([0.0, 0.6, 0.8], points.shape)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import backend
+from deepclouds.backend import backend, vectors_of
 from deepclouds.errors import InputError
 from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import trace_walks
@@ -69,8 +69,8 @@ def make_shard(
         albedo = np.maximum(albedo, np.float32(0.01))
     tau = optical_depth(
         field,
-        types.Array3f(np.ascontiguousarray(np.repeat(point, config.suns, axis=0).T)),
-        types.Array3f(np.ascontiguousarray(suns.reshape(-1, 3).T)),
+        vectors_of(types, np.repeat(point, config.suns, axis=0)),
+        vectors_of(types, suns.reshape(-1, 3)),
         types.Float(0),
         types.Float(np.inf),
         types.Bool(True),
