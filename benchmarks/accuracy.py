@@ -37,6 +37,7 @@ _TITLES = {
     "scene": "Scenes",
     "corrected": "Scenes, corrected by audit walks",
     "furnace": "White furnace",
+    "furnace, corrected": "White furnace, corrected by audit walks",
     "slabs": "Slabs",
     "labels": "Held-out labels",
     "special": "Special cases",
@@ -52,7 +53,7 @@ class Size:
     Attributes
     ----------
     spp, furnace_spp
-        samples a pixel of the scenes, and of each of the furnace's two renders.
+        samples a pixel of the scenes, and of each of the furnace's renders.
     clouds
         of the furnace.
     every

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +35,14 @@ _LEAST = _TILE * _TILE // 4
 
 @dataclass(frozen=True)
 class FurnaceCloud:
-    """One cloud: what it is, its size in mean free paths, g, and the means of its tiles (tiles, 2 seeds)."""
+    """One cloud: what it is, its size in mean free paths, g, and the means of its tiles (tiles, 2 seeds); those of corrected images too."""
 
     family: str
     seed: int
     size: float
     g: float
     tiles: Floats
+    corrected: Floats | None = None
 
     @property
     def mean(self) -> float:
@@ -64,7 +65,7 @@ def plan(clouds: int) -> list[tuple[str, int, float, float]]:
 
 
 def measure_furnace(predictor: Predicts, clouds: int, spp: int, progress: Callable[[str], None]) -> list[FurnaceCloud]:
-    """Render each cloud twice with `spp` samples a pixel; clouds that cover no tile are left out."""
+    """Render each cloud twice with `spp` samples a pixel, by the network alone and corrected; clouds that cover no tile are left out."""
     done = []
     with tempfile.TemporaryDirectory() as folder:
         light, file = Path(folder) / "white.exr", Path(folder) / "cloud.vol"
@@ -83,9 +84,12 @@ def measure_furnace(predictor: Predicts, clouds: int, spp: int, progress: Callab
                 size=(_SIDE, _SIDE),
                 view=(37.0 * seed % 360, 5.0),
             )
-            results = [renderer.render(spp, 2 * seed + repeat) for repeat in range(2)]
-            opacity = np.asarray(0.5 * (results[0].channels["volume_opacity"] + results[1].channels["volume_opacity"]), np.float64)
-            cloud = FurnaceCloud(family, seed, size, g, tile_means([np.asarray(r.rgb, np.float64) for r in results], opacity > 0.5))
+            alone, corrected = (
+                [renderer.render(spp, 2 * seed + repeat, correct=correct) for repeat in range(2)] for correct in (False, True)
+            )
+            opaque = np.asarray(0.5 * (alone[0].channels["volume_opacity"] + alone[1].channels["volume_opacity"]), np.float64) > 0.5
+            tiles = (tile_means([np.asarray(r.rgb, np.float64) for r in results], opaque) for results in (alone, corrected))
+            cloud = FurnaceCloud(family, seed, size, g, *tiles)
             progress(f"furnace  {family} {seed}, {size:.0f} mean free paths, g {g}: {len(cloud.tiles)} tiles")
             if len(cloud.tiles):
                 done.append(cloud)
@@ -106,9 +110,9 @@ def tile_means(images: list[Floats], counts: NDArray[np.bool_]) -> Floats:
 
 
 def furnace_rows(clouds: list[FurnaceCloud]) -> list[Row]:
-    """Rms and mean deviation of all tiles, and by g; intervals are over clouds."""
+    """Rms and mean deviation of all tiles, by g, and of corrected images; intervals are over clouds."""
 
-    def row(name: str, chosen: list[FurnaceCloud]) -> Row:
+    def row(part: str, name: str, chosen: list[FurnaceCloud]) -> Row:
         # Per cloud: tiles, sums of the deviation, of the product of both seeds' deviations, and of their squared difference.
         cases = np.array(
             [
@@ -125,7 +129,12 @@ def furnace_rows(clouds: list[FurnaceCloud]) -> list[Row]:
             "mean": bootstrap(cases, lambda v: v[..., 1].sum(axis=1) / v[..., 0].sum(axis=1), signed=True),
             "noise taken out": bootstrap(cases, root(3)),
         }
-        return Row("furnace", f"{name}, {len(chosen)} clouds", figures)
+        return Row(part, f"{name}, {len(chosen)} clouds", figures)
 
     groups = [(f"g {g}", [c for c in clouds if c.g == g]) for g in ASYMMETRIES]
-    return [row("all", clouds), *(row(name, chosen) for name, chosen in groups if chosen)]
+    corrected = [replace(c, tiles=c.corrected) for c in clouds if c.corrected is not None]
+    return [
+        row("furnace", "all", clouds),
+        *(row("furnace", name, chosen) for name, chosen in groups if chosen),
+        *([row("furnace, corrected", "all", corrected)] if corrected else []),
+    ]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from deepclouds.backend import vectors_of
 from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.correction import FLOOR
-from deepclouds_runtime.frame_source import Arriving, Seen, frame_source
+from deepclouds_runtime.frame_source import Arriving, Seen, frame_source, part_of_time
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import on_host
 from deepclouds_runtime.scattering import NetworkScattering
@@ -58,7 +58,7 @@ class AllRound:
         points of the cloud that surfaces see, and the directions (n, 3) in which they see them.
     counts
         (n,) how much the light from there counts in the image.
-    root, tolerance, budget
+    root, tolerance, budget, until
         see `frame_source`.
     walks
         estimate J of more light, at nodes of their own; None for no more.
@@ -91,12 +91,15 @@ class AllRound:
         budget: int,
         walks: LightWalks | None = None,
         seed: int = 0,
+        until: float = math.inf,
     ) -> None:
         eyes = [Direction(w) for w in spread(DIRECTIONS)]
-        found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS)]
+        walked = walks is not None and isinstance(cloud.scattering, NetworkScattering)
+        first = part_of_time(until, 0.5) if walked else until
+        found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, first)]
         if walks is not None and isinstance(cloud.scattering, NetworkScattering):
             most = _WALKS_A_QUERY * budget
-            found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, most, seed, fit, _HARMONICS))
+            found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, most, seed, fit, _HARMONICS, until))
         self.sources = [source for source in found if source is not None]
         self._channels, self._types = len(cloud.albedo), cloud.field.types
         self.queries = sum(source.queries for source in self.sources)

@@ -28,7 +28,7 @@ _DARK = 0.02
 _LOOKED_AT = 1 << 16
 # Walks of a round, after which somebody is asked whether to go on. The first is judged, which costs as much as tracing some hundred
 # thousand; the next judgement follows when all that may be spent are there.
-_ROUND = 1 << 18
+ROUND = 1 << 18
 # Walks by default: so many a pixel, within these limits.
 WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
 # Where what is left may still be so many times what was asked for, walks go on to so many times their number.
@@ -195,7 +195,15 @@ class Outcome:
     found: dict[str, Any]
 
 
-def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: float, most: int, more: Callable[[float], bool]) -> Outcome:
+def audited(
+    audit: Audit,
+    sources: Sequence[FrameSource],
+    correct: bool,
+    error: float,
+    most: int,
+    more: Callable[[float], bool],
+    at_once: int = ROUND,
+) -> Outcome:
     """Audit sources and, where it helps, correct them.
 
     Parameters
@@ -210,12 +218,14 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
         most walks; in order to correct, three times as many, up to `MOST`, where what is left may then still be above 1.25 times `error`.
     more
         is asked between rounds whether to go on; judging and correcting will then take the seconds it is given.
+    at_once
+        walks of a round.
 
     Returns
     -------
     The sources, and what was found; nothing where the camera sees no cloud.
     """
-    audit.extend(min(_ROUND, most))
+    audit.extend(min(at_once, most))
     if not audit.count:
         return Outcome(list(sources), {})
     limit = most
@@ -235,7 +245,7 @@ def audited(audit: Audit, sources: Sequence[FrameSource], correct: bool, error: 
         if 1.1 * audit.count > limit:
             break
         while audit.count < limit and more(ending):
-            audit.extend(min(_ROUND, limit - audit.count))
+            audit.extend(min(at_once, limit - audit.count))
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}
     if correct:
         correction = audit.correction()

@@ -22,6 +22,7 @@ _PARTS = {
     "scene": "Images of scenes against path-traced references",
     "corrected": "The same, corrected by audit walks as `deepclouds render` does by default",
     "furnace": "White furnace: deviation from 1",
+    "furnace, corrected": "The same, corrected by audit walks as `deepclouds render` does by default",
     "slabs": "Flux of plane-parallel slabs against the discrete-ordinate method",
     "labels": "Held-out labels",
     "special": "Cases known to be hard",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -17,14 +18,25 @@ from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
 from deepclouds_runtime.all_round import AllRound, spread
-from deepclouds_runtime.audit import FEWEST, MOST, WALKS_A_PIXEL, Audit, audited
+from deepclouds_runtime.audit import FEWEST, MOST, ROUND, WALKS_A_PIXEL, Audit, audited
 from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import confidence, relative_errors
 from deepclouds_runtime.disc import background, looks_into
 from deepclouds_runtime.fast import fast_cloud_light
 from deepclouds_runtime.film import Film
-from deepclouds_runtime.frame_source import Arriving, FrameSource, frame_source, from_beams, from_source, from_suns, of_beams, seen_by
+from deepclouds_runtime.frame_source import (
+    Arriving,
+    FrameSource,
+    Seen,
+    frame_source,
+    from_beams,
+    from_source,
+    from_suns,
+    of_beams,
+    part_of_time,
+    seen_by,
+)
 from deepclouds_runtime.light_walks import BRIGHT, LightWalks
 from deepclouds_runtime.lights import Environment, LightSource
 from deepclouds_runtime.result import Image
@@ -36,6 +48,7 @@ from deepclouds_runtime.thrown import ThrownLight
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 from deepclouds_runtime.walked_source import walked_source
 
+_LOG = logging.getLogger(__name__)
 # Noise of a pixel that the fast mode aims at, over the mean.
 ERROR = 0.02
 # Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB. Those that end in a query or a walk take long, and
@@ -49,8 +62,9 @@ _BUDGET = 60_000
 _BEAMS, _BRIGHT = 48, 0.1
 # The same for light that the cloud throws on surfaces, and for that of surfaces which it throws back to them.
 _BEAMS_THROWN, _BEAMS_BACK = 12, 4
-# Most walks at nodes for light from all around, and the longest edge of a box, in mean free paths, through which they are still cheap.
-_WALKS_AROUND, _LONGEST = 1 << 21, 1000.0
+# Most walks at nodes for light from all around; and of how many collisions on the mean they are still cheaper than queries, by so many
+# walks that are tried.
+_WALKS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 21, 1000.0, 1024
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
@@ -63,6 +77,10 @@ _WALKS_THROWN = 1 << 17
 _DEPTHS, _DEPTHS_SUNS = 4, 8
 # Most walks where the time decides, and by how much longer than a trial says samples take: rounds end before the time does.
 _MOST_TIMED, _SLOWER = 1 << 26, 1.3
+# There walks come in smaller rounds, and there are none unless there are so many seconds for them; those for thrown light need more.
+_TIMED_ROUND, _LEAST_AUDIT, _LEAST_THROWN = 1 << 15, 0.25, 1.5
+# Of more pixels than these a trial takes one in sixteen, else one in four.
+_MANY_PIXELS = 1 << 16
 # Of an error that is missed because of the network: samples cost less than the walks that would bring that down.
 _LEAST_NOISE = 0.63
 
@@ -136,15 +154,6 @@ class Frame:
         }
 
     @property
-    def _walkable(self) -> bool:
-        """Whether walks through the cloud are short enough to be started at nodes."""
-        network = self.cloud.scattering
-        if not isinstance(network, NetworkScattering) or network.descriptor.empty:
-            return False
-        longest = float(np.linalg.norm(self.cloud.field.volume.to_world[:3, :3], axis=0).max())
-        return longest <= _LONGEST * network.descriptor.unit
-
-    @property
     def _roughly(self) -> Cloud:
         return self.cloud if self.quick is None else replace(self.cloud, scattering=self.quick)
 
@@ -153,19 +162,31 @@ class Frame:
         """The cloud as surfaces see it."""
         return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
 
-    def _walked(self, sources: Sequence[tuple[LightSource, int]], corrected: bool) -> LightWalks | None:
-        """Walks for what is not bright of `sources`, where an image is corrected by walks anyway."""
-        if not corrected or not sources or not self._walkable:
+    def _walked(
+        self, sources: Sequence[tuple[LightSource, int]], corrected: bool, seen: Seen, along: NDArray[np.float64]
+    ) -> LightWalks | None:
+        """Walks for what is not bright of `sources`, where walks correct the image anyway and those from what is `seen` are short."""
+        network = self.cloud.scattering
+        if not corrected or not sources or not isinstance(network, NetworkScattering) or network.descriptor.empty or not len(seen.points):
             return None
-        return LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade), smooth=True)
+        walks = LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade), smooth=True)
+        some = np.linspace(0, len(seen.points) - 1, _COUNTED).astype(np.int64)
+        collisions = walks.collisions(seen.points[some], along[some], np.random.default_rng([self.seed & 0xFFFFFFFF, 0xC011]))
+        return walks if collisions <= _MOST_COLLISIONS else None
 
     def _bright(self, sources: Sequence[tuple[LightSource, int]]) -> list[Arriving]:
         """What is bright of environments, as suns."""
         parts = [source.bright_part(BRIGHT) for source, _ in sources if isinstance(source, Environment)]
         return [light for part in parts if part for light in of_beams(self.types, part.light, part.beams(), True, self.seed)]
 
-    def prepare_thrown(self, tolerance: float, corrected: bool = False) -> None:
-        """Predict multiple scattering for the light that the cloud throws on surfaces; from then on their rays ask no network."""
+    def prepare_thrown(self, tolerance: float, corrected: bool = False, until: float = math.inf) -> None:
+        """Predict multiple scattering for the light that the cloud throws on surfaces; from then on their rays ask no network.
+
+        Parameters
+        ----------
+        tolerance, corrected, until
+            see `prepare`.
+        """
         clock = time.perf_counter()
         types = self.types
         lower, upper = self.cloud.field.volume.bounds
@@ -197,19 +218,19 @@ class Frame:
             counts = np.square(radius / np.maximum(np.linalg.norm(places - 0.5 * (lower + upper), axis=1), radius))
             counts[len(parts[0][0]) :] = 0
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
-            walks = self._walked(self.on_surfaces.sources, corrected)
+            walks = self._walked(self.on_surfaces.sources, corrected, seen, ahead[seen.rays])
             if walks is not None:
                 lights += self._bright(self.on_surfaces.sources)
             else:
                 for source, _ in self.on_surfaces.sources:
                     lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            where = seen, ahead[seen.rays], counts[seen.rays]
-            self.all_round = AllRound(self._roughly, lights, *where, _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed)
+            how = _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed, until
+            self.all_round = AllRound(self._roughly, lights, seen, ahead[seen.rays], counts[seen.rays], *how)
             self.counts.queries += self.all_round.queries
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
         self.spent("light on surfaces", clock)
 
-    def prepare_thrown_back(self, tolerance: float, corrected: bool = False) -> None:
+    def prepare_thrown_back(self, tolerance: float, corrected: bool = False, until: float = math.inf) -> None:
         """The same for what surfaces send to the cloud, and it back to them: once, in the light that `on_cloud` has of them."""
         first = self.all_round
         if first is None:
@@ -217,14 +238,14 @@ class Frame:
         clock = time.perf_counter()
         lights: list[Arriving] = []
         sources = self.on_cloud.sources[len(self.on_surfaces.sources) :]
-        walks = self._walked(sources, corrected)
+        walks = self._walked(sources, corrected, first.seen, first.along)
         for source, _ in sources if walks is None else ():
             # Of so few parts, what one point sees in the middle is a poor measure: a shadow there would stand for all.
             lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.
         wide = 2 * _THROWN * tolerance
-        where = first.seen, first.along, first.counts
-        first.again = AllRound(self._roughly, lights, *where, _ROOT_AROUND, wide, _BUDGET // 4, walks, self.seed + 1)
+        how = _ROOT_AROUND, wide, _BUDGET // 4, walks, self.seed + 1, until
+        first.again = AllRound(self._roughly, lights, first.seen, first.along, first.counts, *how)
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
@@ -237,7 +258,7 @@ class Frame:
         one = dr.opaque(self.types.UInt32, 1)
         return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
 
-    def prepare(self, tolerance: float, quick: bool = False, corrected: bool = False) -> None:
+    def prepare(self, tolerance: float, quick: bool = False, corrected: bool = False, until: float = math.inf) -> None:
         """Predict multiple scattering for this camera; from then on camera rays ask no network.
 
         Parameters
@@ -248,6 +269,8 @@ class Frame:
             at an eighth of the nodes.
         corrected
             walks will correct what is predicted for suns, and with it what the interpolation errs: fewer nodes do.
+        until
+            about when to be done, in seconds of `time.perf_counter`: there are no more nodes than that leaves time for.
         """
         clock = time.perf_counter()
         pixel, numbers = self._pilot(_PILOT // 4 if quick else _PILOT)
@@ -258,7 +281,7 @@ class Frame:
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
         wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
-        walks = self._walked(self.on_cloud.sources, corrected)
+        walks = self._walked(self.on_cloud.sources, corrected, seen, self.camera.toward(seen.points))
         for source, _ in self.on_cloud.sources:
             around += from_source(self.types, source, beams, isinstance(source, Environment), self.seed)
         power = sum(max(light.irradiance) for light in around)
@@ -273,15 +296,16 @@ class Frame:
         parts[1] = max(parts[1] - sum(max(light.irradiance) for light in bright), 0.0)
         of_suns, of_around = (tolerance / math.sqrt(max(part / max(sum(parts), 1e-30), 1e-6)) for part in parts)
         of_suns *= _CORRECTED if corrected else 1.0
+        eyes, first = [self.camera], part_of_time(until, 0.5) if around or walks is not None else until
         found = {
-            "suns": frame_source(self.cloud, suns, [self.camera], seen, wide * _ROOT, of_suns, _BUDGET),
+            "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first),
         }
         if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
             how = seen, _ROOT_AROUND, of_around, _WALKS_AROUND, self.seed
-            found["light from all around"] = walked_source(self.cloud, self.cloud.scattering, walks, [self.camera], *how)
+            found["light from all around"] = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until)
         else:
             found["light from all around"] = frame_source(
-                self._roughly, around, [self.camera], seen, wide * _ROOT_AROUND, of_around, _BUDGET
+                self._roughly, around, eyes, seen, wide * _ROOT_AROUND, of_around, _BUDGET, until=until
             )
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
@@ -294,35 +318,43 @@ class Frame:
         if not self.sources:
             return
         clock = time.perf_counter()
+        if until - clock < _LEAST_AUDIT:
+            _LOG.info("no time was left to measure the network's error, or to correct it")
+            return
         width, height = self.scene.size
         found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, (width, height), self.seed)
-        most = _MOST_TIMED
+        most, at_once, of_thrown = _MOST_TIMED, _TIMED_ROUND, _WALKS_THROWN // 4
         if math.isinf(until):
             # Walks are as noisy as any path: half of the error takes four times as many.
             most = int(np.clip(WALKS_A_PIXEL * width * height * (ERROR / error) ** 2, FEWEST, MOST))
+            at_once, of_thrown = ROUND, _WALKS_THROWN
 
         def more(seconds: float) -> bool:
             return time.perf_counter() + seconds < until and not (interrupted is not None and interrupted())
 
         thrown = None
-        if correct and self.all_round is not None and more(0.0):
+        if correct and self.all_round is not None and more(_LEAST_THROWN):
             walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
-            thrown = self.all_round.correct(walks, _WALKS_THROWN, self.seed)
-        outcome = audited(found, self.sources, correct, error, most, more)
+            thrown = self.all_round.correct(walks, of_thrown, self.seed)
+        outcome = audited(found, self.sources, correct, error, most, more, at_once)
         self.sources, self.found = outcome.sources, outcome.found
         if thrown is not None and self.found:
             self.found = {**self.found, "thrown": thrown}
         self.spent("audit", clock)
 
-    def sampling_seconds(self, error: float) -> float:
-        """How long camera samples will take to the noise that `noise_goal` asks for at least, by two samples of one pixel in four."""
+    def sampling_seconds(self, error: float) -> tuple[float, float]:
+        """How long camera samples will take, by two samples of some of the pixels.
+
+        One of every pixel, and those that bring the noise to what `noise_goal` asks for at least.
+        """
         clock = time.perf_counter()
         # Not what the film smooths: of that a few samples know little. It takes about as long again, and a few more of them.
         smoothed = self.film.thrown is not None
         trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False)
         width, height = self.scene.size
         y, x = np.divmod(np.arange(width * height, dtype=np.uint32), np.uint32(width))
-        pixels = np.flatnonzero((x // 8 % 2 == 0) & (y // 8 % 2 == 0)).astype(np.uint32)
+        apart = 4 if width * height > _MANY_PIXELS else 2
+        pixels = np.flatnonzero((x // 8 % apart == 0) & (y // 8 % apart == 0)).astype(np.uint32)
         images = []
         for sample in range(2):
             started = time.perf_counter()
@@ -332,13 +364,14 @@ class Frame:
         self.spent("trial", clock)
         first, mean = images[0], 0.5 * images[1]
         lit = mean > DARK * np.quantile(mean, 0.999)
+        of_one = _SLOWER * spent * width * height / len(pixels)
         if not lit.any():
-            return 0.0
+            return of_one, of_one
         noise = float(np.sqrt(np.mean(np.square((mean - first)[lit]))) / mean[lit].mean())
         samples = max(2 * (noise / (_LEAST_NOISE * error)) ** 1.5, 4.0 if smoothed else 3.0)
         # Two of every pixel, the others of those that are not dark.
-        seconds: float = spent * width * height / len(pixels) * (2 + (samples - 2) * float(lit.any(axis=1).mean()))
-        return (2 if smoothed else 1) * _SLOWER * seconds
+        seconds: float = of_one * (2 + (samples - 2) * float(lit.any(axis=1).mean()))
+        return of_one, (2 if smoothed else 1) * seconds
 
     def noise_goal(self, error: float) -> float:
         """Noise of a pixel that makes an error together with what walks have left of the network's; at least `_LEAST_NOISE` of it."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -38,6 +39,8 @@ _DEEP = 1e6
 _AROUND, _REACH = 32, 2.0
 # Of a budget of queries, what the corners of the coarsest cells may take.
 _OVERDRAWN = 4
+# Corners that the coarsest cells have at least, however short the time, and points that there is always time for.
+_LEAST_CORNERS, _UNLIMITED = 64, 1 << 62
 
 
 @dataclass(frozen=True)
@@ -240,6 +243,7 @@ def frame_source(
     budget: int,
     combine: Callable[[Array], Array] = operator.itemgetter(0),
     every: int = 1,
+    until: float = math.inf,
 ) -> FrameSource | None:
     """J of a frame; None where it is 0 everywhere.
 
@@ -262,6 +266,8 @@ def frame_source(
         makes the fields (n, l) that are interpolated of the values (eyes, n, k).
     every
         of so many fields the first is a value of J; the others may have any sign.
+    until
+        about when to be done, in seconds of `time.perf_counter`: there are no more nodes than should be ready by then.
     """
     network = cloud.scattering
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
@@ -270,7 +276,7 @@ def frame_source(
     predicted = _Predicted(cloud, network, lights, albedos, eyes, combine)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     checks = max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes)))
-    return interpolated(cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every)
+    return interpolated(cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until)
 
 
 class Evaluates(Protocol):
@@ -305,12 +311,13 @@ def interpolated(
     checks: int,
     lights: int,
     every: int = 1,
+    until: float = math.inf,
 ) -> FrameSource:
     """What `evaluate` says at the nodes of an octree, interpolated.
 
     Parameters
     ----------
-    field, seen, root, tolerance, every
+    field, seen, root, tolerance, every, until
         as for `frame_source`.
     network
         has the unit of length, and what nodes are aligned to.
@@ -324,20 +331,49 @@ def interpolated(
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
-    spacing, most = root * network.descriptor.unit, _OVERDRAWN * nodes
+    # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
+    held_out, built_for = _split(seen, min(checks, len(seen.points) // 2))
+    paced = _Paced(evaluate, until)
+    # The pace is that of the last call: the first one may have kernels to compile.
+    parts = [paced(part) for part in np.array_split(held_out.points, 1 if math.isinf(until) else 2) if len(part)]
+    true = np.concatenate(parts) if parts else np.empty((0, 0))
+    spacing, most = root * network.descriptor.unit, min(_OVERDRAWN * nodes, max(paced.affordable(), _LEAST_CORNERS))
     while True:
         lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
         corners = root_nodes(lattice, seen.points, most)
         if corners <= most or lattice.size.max() <= 2:
             break
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
-    # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
-    held_out, built_for = _split(seen, min(checks, len(seen.points) // 2))
-    octree = Octree(lattice, evaluate, built_for.points, built_for.weights, tolerance, nodes, _LEVELS, evaluate.carried)
+    octree = Octree(lattice, paced, built_for.points, built_for.weights, tolerance, nodes, _LEVELS, evaluate.carried, paced.affordable)
     device = octree.upload(field.types)
-    factor, error = _audit(device, evaluate, held_out, every)
+    factor, error = _audit(device, true, held_out, every)
     doubt = octree.upload(field.types, carried=True) if evaluate.carried else None
     return FrameSource(device, evaluate.mix * factor, octree.statistics, error, evaluate.queries, lights, evaluate.model, doubt, octree)
+
+
+def part_of_time(until: float, share: float) -> float:
+    """The end of a share of the time from now until then, in seconds of `time.perf_counter`."""
+    now = time.perf_counter()
+    return now + share * (until - now)
+
+
+class _Paced:
+    """What an octree interpolates, and how many more points it may be asked for until a time."""
+
+    def __init__(self, evaluate: Evaluates, until: float) -> None:
+        self._evaluate, self._until, self._pace = evaluate, until, 0.0
+
+    def __call__(self, points: Array) -> Array:
+        clock = time.perf_counter()
+        values = self._evaluate(points)
+        if len(points):
+            self._pace = (time.perf_counter() - clock) / len(points)
+        return values
+
+    def affordable(self) -> int:
+        """By the pace of the last call."""
+        left = self._until - time.perf_counter()
+        return _UNLIMITED if math.isinf(left) else int(max(left, 0.0) / max(self._pace, 1e-9))
 
 
 class _Predicted:
@@ -457,15 +493,15 @@ def _split(seen: Seen, count: int) -> tuple[Seen, Seen]:
     return Seen(seen.points[chosen], np.ones(count), seen.rays[chosen]), Seen(seen.points[rest], seen.weights[rest], seen.rays[rest])
 
 
-def _audit(octree: DeviceOctree, evaluate: Callable[[Array], Array], checks: Seen, every: int) -> tuple[float, float]:
-    """Compare interpolated with true values at points that the camera sees.
+def _audit(octree: DeviceOctree, values_there: Array, checks: Seen, every: int) -> tuple[float, float]:
+    """Compare interpolated with true values (n, fields and more) at n points that the camera sees.
 
     A cloud is bright where it is dense, and nodes lie anywhere: interpolation is a little too dark. Returns the factor that makes up for it
     on the mean, and the error that remains at a point, root of the mean square over the mean.
     """
     if not len(checks.points):
         return 1.0, 0.0
-    true = evaluate(checks.points)[:, : octree.fields].astype(np.float64)[:, ::every]
+    true = values_there[:, : octree.fields].astype(np.float64)[:, ::every]
     values = octree.lookup(octree.to_local(vectors_of(octree.types, checks.points)), octree.types.Bool(True))
     dr.eval(values)
     interpolated = np.stack([np.array(v, np.float64) for v in values[::every]], axis=1)

@@ -20,6 +20,8 @@ from deepclouds_runtime.transport import Cloud, Lights, taker
 
 # Directions of an environment that are so many times brighter than its mean are connected to, as a sun is: walks seldom leave toward them.
 BRIGHT = 8.0
+# Albedo of walks whose collisions are counted; and collisions until a walk is thinned out, times the share absorbed in each.
+_NEARLY_ONE, _THINNED = 0.9999, 3.3
 
 
 class LightWalks:
@@ -71,6 +73,23 @@ class LightWalks:
                 light = self._connected[number] if self._connected else None
                 result[chosen] = self._of_one(points[chosen], along[chosen], light, float(of_light), key + number, random)
         return result
+
+    def collisions(self, points: Array, along: Array, random: np.random.Generator) -> float:
+        """How often walks from world points (n, 3) seen along unit vectors (n, 3) collide on the mean, by one walk a point.
+
+        Of absorbed walks those count that are left before the rest is thinned out.
+        """
+        cloud, n = self._cloud, len(points)
+        # The weight of a walk in a medium that absorbs next to nothing tells how often it collided.
+        albedos = np.full((n, 1), _NEARLY_ONE, np.float32)
+        lobes = np.broadcast_to(np.array(cloud.phase, np.float32), (n, 3))
+        key = int(random.integers(1 << 32))
+        _, escapes = trace_to_escape(cloud.field, points.astype(np.float32), along.astype(np.float32), lobes, None, albedos, key)
+        weight = np.array(escapes.weight[0], np.float64)
+        count = np.where(weight > 0, np.log(np.maximum(weight, 1e-30)) / math.log(np.float32(_NEARLY_ONE)), 0)
+        brightest = max(cloud.albedo, default=0.0) if cloud.varying is None else 1.0
+        most = _THINNED / (1 - brightest) if brightest < 1 else math.inf
+        return float(np.minimum(count, most).mean())
 
     def _of_one(self, points: Array, along: Array, light: _Connected | None, share: float, key: int, random: np.random.Generator) -> Array:
         """J (n, channels) of walks that are connected to `light`, a `share` of all."""

@@ -137,6 +137,8 @@ class Octree:
         most levels of refinement.
     carried
         so many of the fields, the last ones, are known at the nodes that the others ask for: they refine nothing.
+    affordable
+        is asked before each level how many more points may be asked for, for another reason than the budget.
 
     Attributes
     ----------
@@ -154,6 +156,7 @@ class Octree:
         budget: int,
         levels: int,
         carried: int = 0,
+        affordable: Callable[[], int] | None = None,
     ) -> None:
         self.lattice = lattice
         self.statistics = Statistics()
@@ -187,9 +190,10 @@ class Octree:
             allowed = (tolerance * scale) ** 2 * total
             # Half of what is left of the error for this level, the rest for the finer ones.
             split = _worst(squared, 0.5 * max(allowed - settled, 0.0))
-            affordable = 0 if level == self._levels else (budget - len(self._keys)) // _NODES_A_SPLIT
-            if affordable < split.sum():
-                split[np.argsort(squared)[: len(split) - max(affordable, 0)]] = False
+            left = 0 if level == self._levels else budget - len(self._keys)
+            splits = (left if affordable is None else min(left, affordable())) // _NODES_A_SPLIT
+            if splits < split.sum():
+                split[np.argsort(squared)[: len(split) - max(splits, 0)]] = False
             settled += float(squared[~split].sum())
             if not split.any():
                 break

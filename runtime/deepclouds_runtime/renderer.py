@@ -21,6 +21,7 @@ from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import doubtful, warning
 from deepclouds_runtime.error_parts import error_parts
 from deepclouds_runtime.frame import ERROR, Frame
+from deepclouds_runtime.frame_source import part_of_time
 from deepclouds_runtime.light_walks import Paths
 from deepclouds_runtime.lights import Shade, environment
 from deepclouds_runtime.result import COLOURS, RenderResult, Statistics
@@ -35,8 +36,14 @@ MODES = ("fast", "reference")
 _MOST_SAMPLES = 1 << 20
 # What the fast mode stops at by itself: a scene whose noise is still too large then says so.
 _MOST_AUTOMATIC = 1024
-# Least and most of the time that is left before an audit that it may take.
-_AUDIT = (0.3, 0.85)
+# Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the root
+# of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
+_AUDIT = (0.65, 0.9)
+# Where one sample a pixel takes more of what is left than this, each draws one direction from an environment.
+_DEAR = 0.4
+# Of a time limit, what predictions may take where walks correct them and where nothing does, and of the former what is left for them
+# each time that light thrown on surfaces is predicted.
+_PREDICTION, _PREDICTION_ALONE, _ON_SURFACES = 0.35, 0.7, 0.25
 # By how much less than the usual noise keeps pixels awake where the time alone decides.
 _TIMED = 0.25
 # Error of the interpolation at a point over the noise of a pixel, both aimed at: along rays and between pixels that of points averages out.
@@ -274,16 +281,24 @@ class Renderer:
             partial(self._result(look, started, None, False))
             frame.counts.queries += look.counts.queries
             frame.spent("quick look", clock)
-        if not self._prepared(frame, lights, error, correct, interrupted):
+        # Walks make up for nodes that there was no time for.
+        by = math.inf if time_limit is None else started + (_PREDICTION if correct else _PREDICTION_ALONE) * time_limit
+        if not self._prepared(frame, lights, error, correct, interrupted, by):
             look = self._quick_look(frame, lights)
             look.round(0, 1, most, None)
             return self._result(look, started, None, False)
         if adaptive and not sampled and (audit or correct):
             until = math.inf
             if time_limit is not None:
-                samples, now = frame.sampling_seconds(error), time.perf_counter()
+                one, all_of_them = frame.sampling_seconds(error)
+                now = time.perf_counter()
                 left = started + time_limit - now
-                until = now + min(max(left - samples, _AUDIT[0] * left), _AUDIT[1] * left)
+                if one > _DEAR * left:
+                    frame.on_cloud = replace(frame.on_cloud, sources=tuple((source, 1) for source, _ in frame.on_cloud.sources))
+                    # Shadow rays toward the environment are most of what a sample costs.
+                    one /= self.environment_directions if frame.on_cloud.sources else 1
+                spare = left - one
+                until = now + min(max(left - all_of_them, _AUDIT[0] * spare), _AUDIT[1] * spare)
             frame.audit(correct, 0.0 if timed else error, until, interrupted)
 
         def so_far(noise: float) -> RenderResult:
@@ -301,22 +316,27 @@ class Renderer:
             noise, stopped = rounds_for_error(frame, most, None if timed else goal, goal, end, not walks, watch, so_far)
         return self._result(frame, started, noise, not stopped)
 
-    def _prepared(self, frame: Frame, lights: Lights, error: float, correct: bool, interrupted: Callable[[], bool] | None) -> bool:
-        """Predict what the frame interpolates, and see what surfaces send to the cloud; False where somebody stopped it."""
+    def _prepared(
+        self, frame: Frame, lights: Lights, error: float, correct: bool, interrupted: Callable[[], bool] | None, until: float
+    ) -> bool:
+        """Predict what the frame interpolates, and see what surfaces send to the cloud, by about the time `until`.
+
+        False where somebody stopped it.
+        """
         adaptive = self.mode == "fast" and frame.cloud.paths is None
         try:
             for network in filter(None, (self._network, frame.quick)):
                 network.stop = interrupted
             if adaptive and self._interreflection:
-                frame.prepare_thrown(_INTERPOLATION * error, correct)
+                frame.prepare_thrown(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
             if self._interreflection:
                 clock = time.perf_counter()
                 reflectors = Reflectors(frame.thrower, lights, frame.seed & 0xFFFFFFFF, frame.counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
-                frame.prepare_thrown_back(_INTERPOLATION * error, correct)
+                frame.prepare_thrown_back(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
             if self.mode == "fast" and not frame.sampled:
-                frame.prepare(_INTERPOLATION * error, corrected=correct)
+                frame.prepare(_INTERPOLATION * error, corrected=correct, until=until)
         except Stopped:
             return False
         finally:

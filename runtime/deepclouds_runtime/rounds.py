@@ -77,14 +77,15 @@ def rounds_for_error(
     watch, so_far
         who is told, and the image so far from its noise.
     """
-    started, noise, growth, pace = time.perf_counter(), math.inf, 2.0, 0.0
+    started, noise, growth = time.perf_counter(), math.inf, 2.0
     frame.round(0, 1, most, None)
+    pace = max(time.perf_counter() - started, 1e-6)
     while frame.samples < most and (target is None or not noise <= target):
         if watch.stops:
             return noise, True
         before, done = frame.film.beauty(), frame.samples
         more = min(math.ceil(done * (growth - 1)), most - done)
-        if done > 1 and not math.isinf(end):
+        if not math.isinf(end):
             left = end - time.perf_counter()
             more = min(more, int(left / pace)) if left > 0 else 0
         if more < 1:

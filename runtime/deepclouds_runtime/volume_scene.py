@@ -26,8 +26,11 @@ _DEFAULT_G = 0.85
 _DEFAULT_SUN = (100.0, 35.0)
 # Wider, a sun is a sky.
 _WIDEST_SUN = 90.0
-# Distance of the disc that stands for it in Mitsuba, over the size of the cloud, and the end of what the camera sees, in distances.
-_FAR_DISC, _FAR_CLIP = 1e4, 1e5
+# Distance of the disc that stands for it in Mitsuba, over the size of the cloud.
+_FAR_DISC = 1e4
+# What the camera sees begins and ends at so many distances of the cloud from it. Mitsuba puts both into kernels as constants: distances are
+# rounded down to powers of `_ALIKE`, so that most views share their kernels.
+_NEAR_CLIP, _FAR_CLIP, _ALIKE = 1e-4, 1e5, 16.0
 # Thinner voxels do not push the camera away: a haze around a cloud is no part of the picture's subject.
 _FRAMED = 0.01
 
@@ -360,6 +363,7 @@ def _camera(corners: NDArray[np.float64], options: VolumeOptions, turn: int) -> 
         middle = 0.5 * (along.min(axis=0) + along.max(axis=0)) @ basis
         views = [basis]
     distance = max(_distance(corners - middle, view, options.size) for view in views)
+    rounded = _ALIKE ** math.floor(math.log(distance, _ALIKE))
     width, height = options.size
     film = {
         "type": "hdrfilm",
@@ -372,8 +376,8 @@ def _camera(corners: NDArray[np.float64], options: VolumeOptions, turn: int) -> 
         "type": "perspective",
         "fov": _FOV,
         "fov_axis": "larger",
-        "near_clip": 1e-4 * distance,
-        "far_clip": _FAR_CLIP * distance,
+        "near_clip": _NEAR_CLIP * rounded,
+        "far_clip": _FAR_CLIP * _ALIKE * rounded,
         "to_world": mi.ScalarTransform4f().look_at(
             origin=(middle - basis[2] * distance).tolist(), target=middle.tolist(), up=basis[1].tolist()
         ),

@@ -6,6 +6,7 @@ hundred walks from a node cost less, and know J to a few percent, without bias.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Sequence
 
@@ -41,12 +42,13 @@ def walked_source(
     seed: int,
     combine: Callable[[Array], Array] = operator.itemgetter(0),
     every: int = 1,
+    until: float = math.inf,
 ) -> FrameSource | None:
     """J of a frame under the lights of `walks`; None where the camera sees no cloud, or it is black.
 
     Parameters
     ----------
-    cloud, eyes, seen, root, tolerance, combine, every
+    cloud, eyes, seen, root, tolerance, combine, every, until
         see `deepclouds_runtime.frame_source.frame_source`.
     network
         has the unit of length, and knows whether to give up, by `Stopped`; it is not asked.
@@ -63,7 +65,7 @@ def walked_source(
     if len(eyes) == 1:
         found.choose(seen)
     nodes, checks = most // (found.each * len(eyes)), max(_LEAST_CHECKS, _CHECKS // len(eyes))
-    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every)
+    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until)
 
 
 class _Walked:

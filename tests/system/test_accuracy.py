@@ -77,9 +77,12 @@ def test_the_furnace_takes_noise_out() -> None:
     clouds = []
     for i in range(12):
         bias = 0.02 * np.where(rng.random((400, 1)) < 0.5, -1, 1) + 0.01
-        clouds.append(FurnaceCloud("congestus", i, 30.0, (0.0, 0.6, 0.85)[i % 3], 1 + bias + 0.03 * rng.normal(size=(400, 2))))
+        tiles = 1 + bias + 0.03 * rng.normal(size=(400, 2))
+        clouds.append(FurnaceCloud("congestus", i, 30.0, (0.0, 0.6, 0.85)[i % 3], tiles, 2 * tiles - 1))
     rows = furnace_rows(clouds)
-    assert [row.case for row in rows] == ["all, 12 clouds", "g 0.0, 4 clouds", "g 0.6, 4 clouds", "g 0.85, 4 clouds"]
+    assert [row.case for row in rows] == ["all, 12 clouds", "g 0.0, 4 clouds", "g 0.6, 4 clouds", "g 0.85, 4 clouds", "all, 12 clouds"]
+    assert [row.part for row in rows] == 4 * ["furnace"] + ["furnace, corrected"]
+    assert rows[4].figures["rms"].value == pytest.approx(2 * rows[0].figures["rms"].value)
     figures = rows[0].figures
     assert figures["rms"].value == pytest.approx(np.sqrt(0.02**2 + 0.01**2), rel=0.05)
     assert figures["mean"].value == pytest.approx(0.01, abs=0.002)
@@ -200,7 +203,16 @@ def test_it_runs(tmp_path: Path, small_dataset: Path, capsys: pytest.CaptureFixt
     assert {p.name for p in tmp_path.glob("*.png")} == {f"accuracy_{name}.png" for name in pictures}
     kept = json.loads((tmp_path / "accuracy.json").read_text())
     assert kept["headline"] == lines[-1]
-    assert {row["part"] for row in kept["rows"]} == {"scene", "corrected", "furnace", "slabs", "labels", "special", "confidence"}
+    assert {row["part"] for row in kept["rows"]} == {
+        "scene",
+        "corrected",
+        "furnace",
+        "furnace, corrected",
+        "slabs",
+        "labels",
+        "special",
+        "confidence",
+    }
 
 
 def test_bad_input_is_refused(tmp_path: Path) -> None:

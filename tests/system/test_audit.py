@@ -6,6 +6,7 @@ correction brings the image nearer to one by walks, images stay positive, and on
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -139,7 +140,7 @@ def test_light_on_surfaces_is_that_of_paths_and_corrected_by_a_factor(floor: Pat
         walked = rendered(floor, monkeypatch, kind, correct=True, spp=256)
         np.testing.assert_allclose(_on_floor(walked), _on_floor(paths), rtol=0.02)
     # What harmonics and nodes err is corrected too, whether the network is right or not; here it is asked for all light.
-    monkeypatch.setattr(frame, "_LONGEST", 0.0)
+    monkeypatch.setattr(frame, "_MOST_COLLISIONS", 0.0)
     right, constant = (rendered(floor, monkeypatch, kind, correct=True) for kind in ("none", "constant"))
     ours, theirs = (image.statistics.audit["thrown"] for image in (right, constant))
     for a, b, deviation in zip(ours["factor"], theirs["factor"], theirs["deviation"], strict=True):
@@ -170,6 +171,18 @@ def test_little_is_corrected_without_harm(scene: Path, monkeypatch: pytest.Monke
         for correct in (False, True)
     )
     assert corrected < 1.1 * alone
+
+
+def test_no_time_is_no_audit(scene: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """The least that makes an image is done all the same."""
+    caplog.set_level(logging.INFO)
+    found = rendered(scene, monkeypatch, "constant", spp=None, correct=True, time_limit=1e-6)
+    assert found.statistics.audit == {}
+    assert found.statistics.spp == 1
+    assert 0 < found.statistics.sources["suns"]["nodes"] <= 64
+    assert np.isfinite(found.rgb).all()
+    assert found.rgb.mean() > 0
+    assert any("no time was left" in record.getMessage() for record in caplog.records)
 
 
 def test_a_seed_makes_one_image(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,16 +304,16 @@ def test_no_walks_correct_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("correct", "model", "longest", "expected"),
+    ("correct", "model", "collisions", "expected"),
     [
         (True, None, 1000.0, {"light from all around": "", "light on surfaces": "fast", "light on surfaces, 2": ""}),
-        (True, None, 1.0, {"light from all around": "fast", "light on surfaces": "fast"}),
+        (True, None, 0.0, {"light from all around": "fast", "light on surfaces": "fast"}),
         (False, None, 1000.0, {"light from all around": "accurate", "light on surfaces": "accurate"}),
-        (True, "fast", 1.0, {"light from all around": "fast", "light on surfaces": "fast"}),
+        (True, "fast", 0.0, {"light from all around": "fast", "light on surfaces": "fast"}),
     ],
 )
 def test_light_from_all_around_is_walked_or_asked_of_the_quick_model(
-    scene: Path, monkeypatch: pytest.MonkeyPatch, correct: bool, model: str | None, longest: float, expected: dict[str, str]
+    scene: Path, monkeypatch: pytest.MonkeyPatch, correct: bool, model: str | None, collisions: float, expected: dict[str, str]
 ) -> None:
     """Expected behaviour: where walks correct it and are not too long; suns are asked of the model that was chosen."""
     for name in ("_BEAMS", "_BEAMS_THROWN", "_BEAMS_BACK"):
@@ -311,7 +324,7 @@ def test_light_from_all_around_is_walked_or_asked_of_the_quick_model(
     )
     scene.write_text(scene.read_text().replace("</scene>", floor))
     monkeypatch.setattr(frame, "_BRIGHT", 2.0)
-    monkeypatch.setattr(frame, "_LONGEST", longest)
+    monkeypatch.setattr(frame, "_MOST_COLLISIONS", collisions)
     found = load(scene, model=model).render(1, seed=3, correct=correct).statistics.sources
     assert {name: source["model"] for name, source in found.items()} == {"suns": model or "accurate", **expected}
     assert all((source["queries"] == 0) == (source["model"] == "") for source in found.values())

@@ -1,8 +1,8 @@
 """Rationale: a number that changes from render to render, baked into a kernel as a constant, makes every render compile that kernel anew,
 which takes longer than to run it.
 
-Expected behaviour: once one image was rendered, others of the same size need no kernels but those that make camera rays, into which Mitsuba
-puts the camera's clipping planes and film: whatever the numbers of samples, queries, nodes and walks, the seed, the view, and the error.
+Expected behaviour: once one image was rendered, others of the same size need no new kernels, whatever the numbers of samples, queries,
+nodes and walks, the seed, the view, and the error.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from deepclouds.backend import backend, lanes_of, rows
 from tests.system.smooth_network import Smooth
 
 CLOUD = Path(deepclouds_runtime.__file__).parent / "data" / "demo.vdb"
-# Rays of the pilot, of the image, and of the audit's walks.
-CAMERA_KERNELS = 3
 # Renders of each kind: memory, which kernels differ by, lies in other places in each.
 TRIES = 3
 
@@ -64,7 +62,7 @@ def test_constants_are_found_out() -> None:
 
 
 @pytest.mark.parametrize("sky", [0.0, 0.3], ids=["sun", "sun and sky"])
-def test_another_view_and_other_counts_compile_camera_rays_alone(sky: float) -> None:
+def test_another_view_and_other_counts_compile_nothing(sky: float) -> None:
     first, *others = (load(CLOUD, predictor=Smooth(), size=(24, 18), sky=sky, view=(40.0 * i, 5.0 + 5 * i)) for i in range(TRIES + 1))
     # An error that is easily reached takes few walks.
     known = kernels(lambda: first.render(8, seed=1, error=0.25, correct=True))
@@ -82,7 +80,7 @@ def test_another_view_and_other_counts_compile_camera_rays_alone(sky: float) -> 
         new(partial(first.render, 5 - i, seed=2 + i, error=0.2 + 0.01 * i, correct=True), counts)
         new(partial(other.render, 3 + i, seed=12 + i, error=0.3 - 0.01 * i, correct=True), views)
         new(partial(other.render, seed=22 + i, error=0.1 + 0.01 * i), dialled)
-    assert counts == [0] * TRIES
-    assert max(views) <= CAMERA_KERNELS, views
+    assert counts == views == [0] * TRIES
     # The dial looks up other fields than an image with a fixed number of samples.
-    assert dialled[0] <= 1 and not any(dialled[1:]), dialled
+    assert dialled[0] <= 1, dialled
+    assert not any(dialled[1:]), dialled

@@ -193,6 +193,11 @@ def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
     again = walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
     assert again is not None
     assert again.statistics == source.statistics
+    # Where the time is over before it began, the fewest nodes.
+    late = walked_source(cloud, network, walks, [Along()], seen, 0.2, 0.05, 1 << 19, 58, until=0.0)
+    assert late is not None
+    assert late.statistics.nodes <= 64
+    assert late.statistics.cells == []
     network.stop = lambda: True
     with pytest.raises(Stopped):
         walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)

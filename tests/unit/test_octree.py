@@ -94,6 +94,20 @@ def test_the_budget_bounds_the_nodes() -> None:
     assert bounded < 1500
 
 
+def test_what_is_affordable_bounds_the_nodes() -> None:
+    """It is asked anew at every level."""
+    points, left, asked = _points(8000, 6), 2000, list[int]()
+
+    def kept(places: NDArray[np.float64]) -> NDArray[np.float32]:
+        asked.append(len(places))
+        return _bump(places)
+
+    octree = Octree(_lattice(0.5), kept, points, np.ones(len(points)), 1e-4, 10**6, 8, affordable=lambda: left - sum(asked))
+    assert 1000 < octree.statistics.nodes == sum(asked) < 2500
+    none = Octree(_lattice(0.5), _bump, points, np.ones(len(points)), 1e-4, 10**6, 8, affordable=lambda: -5)
+    assert none.statistics.cells == []
+
+
 def test_corners_of_the_root_cells_are_counted() -> None:
     lattice, asked = _lattice(0.1), list[int]()
     points = _points(300, 8)
