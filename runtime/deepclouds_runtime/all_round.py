@@ -98,7 +98,7 @@ class AllRound:
         first = part_of_time(until, 0.5) if walked else until
         found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, first)]
         if walks is not None and isinstance(cloud.scattering, NetworkScattering):
-            most = _WALKS_A_QUERY * budget
+            most = min(_WALKS_A_QUERY * budget, walks.most)
             found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, most, seed, fit, _HARMONICS, until))
         self.sources = [source for source in found if source is not None]
         self._channels, self._types = len(cloud.albedo), cloud.field.types

@@ -62,9 +62,8 @@ _BUDGET = 60_000
 _BEAMS, _BRIGHT = 48, 0.1
 # The same for light that the cloud throws on surfaces, and for that of surfaces which it throws back to them.
 _BEAMS_THROWN, _BEAMS_BACK = 12, 4
-# Most walks at nodes for light from all around; and of how many collisions on the mean they are still cheaper than queries, by so many
-# walks that are tried.
-_WALKS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 21, 1000.0, 1024
+# Most collisions of all walks at nodes; of how many on the mean walks are still cheaper than queries, by so many that are tried.
+_COLLISIONS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 26, 1000.0, 1024
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
@@ -172,6 +171,7 @@ class Frame:
         walks = LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade), smooth=True)
         some = np.linspace(0, len(seen.points) - 1, _COUNTED).astype(np.int64)
         collisions = walks.collisions(seen.points[some], along[some], np.random.default_rng([self.seed & 0xFFFFFFFF, 0xC011]))
+        walks.most = int(min(walks.most, _COLLISIONS_AROUND / max(collisions, 1.0)))
         return walks if collisions <= _MOST_COLLISIONS else None
 
     def _bright(self, sources: Sequence[tuple[LightSource, int]]) -> list[Arriving]:
@@ -301,7 +301,7 @@ class Frame:
             "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first),
         }
         if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
-            how = seen, _ROOT_AROUND, of_around, _WALKS_AROUND, self.seed
+            how = seen, _ROOT_AROUND, of_around, walks.most, self.seed
             found["light from all around"] = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until)
         else:
             found["light from all around"] = frame_source(

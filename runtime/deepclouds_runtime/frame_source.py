@@ -312,6 +312,7 @@ def interpolated(
     lights: int,
     every: int = 1,
     until: float = math.inf,
+    overdrawn: int = _OVERDRAWN,
 ) -> FrameSource:
     """What `evaluate` says at the nodes of an octree, interpolated.
 
@@ -322,7 +323,7 @@ def interpolated(
     network
         has the unit of length, and what nodes are aligned to.
     nodes
-        most of them; the corners of the coarsest cells may be four times as many.
+        most of them; the corners of the coarsest cells may be `overdrawn` times as many.
     checks
         points at which the interpolation is measured.
     lights
@@ -337,7 +338,7 @@ def interpolated(
     # The pace is that of the last call: the first one may have kernels to compile.
     parts = [paced(part) for part in np.array_split(held_out.points, 1 if math.isinf(until) else 2) if len(part)]
     true = np.concatenate(parts) if parts else np.empty((0, 0))
-    spacing, most = root * network.descriptor.unit, min(_OVERDRAWN * nodes, max(paced.affordable(), _LEAST_CORNERS))
+    spacing, most = root * network.descriptor.unit, min(overdrawn * nodes, max(paced.affordable(), _LEAST_CORNERS))
     while True:
         lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
         corners = root_nodes(lattice, seen.points, most)

@@ -20,6 +20,8 @@ from deepclouds_runtime.transport import Cloud, Lights, taker
 
 # Directions of an environment that are so many times brighter than its mean are connected to, as a sun is: walks seldom leave toward them.
 BRIGHT = 8.0
+# Most walks at the nodes of one octree.
+AT_NODES = 1 << 21
 # Albedo of walks whose collisions are counted; and collisions until a walk is thinned out, times the share absorbed in each.
 _NEARLY_ONE, _THINNED = 0.9999, 3.3
 
@@ -38,10 +40,13 @@ class LightWalks:
     ----------
     lights
         how many there are.
+    most
+        walks that may be traced at the nodes of one octree.
     """
 
     def __init__(self, cloud: Cloud, lights: Lights, smooth: bool = False) -> None:
         self._cloud, self._lights = cloud, lights
+        self.most = AT_NODES
         self._bright = []
         for source, _ in lights.sources:
             if isinstance(source, Environment) and (part := source.bright_part(BRIGHT)) is not None:

@@ -36,8 +36,8 @@ MODES = ("fast", "reference")
 _MOST_SAMPLES = 1 << 20
 # What the fast mode stops at by itself: a scene whose noise is still too large then says so.
 _MOST_AUTOMATIC = 1024
-# Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the root
-# of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
+# Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the
+# root of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
 _AUDIT = (0.65, 0.9)
 # Where one sample a pixel takes more of what is left than this, each draws one direction from an environment.
 _DEAR = 0.4

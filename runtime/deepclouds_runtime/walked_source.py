@@ -65,7 +65,7 @@ def walked_source(
     if len(eyes) == 1:
         found.choose(seen)
     nodes, checks = most // (found.each * len(eyes)), max(_LEAST_CHECKS, _CHECKS // len(eyes))
-    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until)
+    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until, 1)
 
 
 class _Walked:

@@ -70,7 +70,7 @@ def scene(tmp_path: Path, llvm_mitsuba: ModuleType) -> Path:
     return path
 
 
-def rendered(scene: Path, monkeypatch: pytest.MonkeyPatch, kind: str, seed: int = 0, spp: int = 16, **how: Any) -> RenderResult:
+def rendered(scene: Path, monkeypatch: pytest.MonkeyPatch, kind: str, seed: int = 0, spp: int | None = 16, **how: Any) -> RenderResult:
     """An image in which the network knows the truth, from many walks, times a factor."""
     renderer = load(scene, predictor=Unused())
     # Noise at the nodes is an error too, which the one that is right may not have.

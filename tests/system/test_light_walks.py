@@ -164,6 +164,28 @@ class Unused:
         raise AssertionError
 
 
+def test_collisions_are_counted(types: Any) -> None:
+    """Against walks of a few lines in a homogeneous cube; what is absorbed is thinned out."""
+    volume = Volume.from_box(np.ones((2, 2, 2), np.float32), (-1, -1, -1), (1, 1, 1))
+    random, sigma, n = np.random.default_rng(61), 4.0, 40_000
+    points = random.uniform(-1, 1, (n, 3))
+    count = np.zeros(n)
+    x, inside = points.copy(), np.ones(n, bool)
+    while inside.any():
+        w = random.normal(size=(n, 3))
+        x += w / np.linalg.norm(w, axis=1, keepdims=True) * random.exponential(1 / sigma, (n, 1))
+        inside &= (np.abs(x) < 1).all(axis=1)
+        count += inside
+    along = np.broadcast_to([0.0, 0.0, -1.0], (n, 3))
+    found = {}
+    for albedo in (1.0, 0.5):
+        cloud = Cloud(Field(types, volume, sigma), (albedo,), (0.0, 0.0, 1.0), None)
+        walks = LightWalks(cloud, Lights((), ((sky(types, 1.0), 1),), Shade(types, None)), smooth=True)
+        found[albedo] = walks.collisions(points, along, np.random.default_rng(62))
+    assert found[1.0] == pytest.approx(count.mean(), abs=5 * count.std() / n**0.5)
+    assert found[0.5] == pytest.approx(np.minimum(count, 6.6).mean(), abs=5 * count.std() / n**0.5)
+
+
 def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
     cloud = Cloud(field(types), ALBEDO, PHASE, None)
     lights = Lights((), ((sky(types, 1.0), 1),), Shade(types, None))
