@@ -44,6 +44,8 @@ _DEAR = 0.4
 # Of a time limit, what predictions may take where walks correct them and where nothing does, and of the former what is left for them
 # each time that light thrown on surfaces is predicted.
 _PREDICTION, _PREDICTION_ALONE, _ON_SURFACES = 0.35, 0.7, 0.25
+# How often light goes from the surfaces to the cloud and back.
+_TURNS = 2
 # By how much less than the usual noise keeps pixels awake where the time alone decides.
 _TIMED = 0.25
 # Error of the interpolation at a point over the noise of a pixel, both aimed at: along rays and between pixels that of points averages out.
@@ -72,7 +74,7 @@ class Renderer:
     environment_directions
         directions drawn from an environment at each sample of the cloud.
     interreflection
-        whether surfaces receive the cloud's light, and the cloud that of the surfaces. Light that goes back and forth more than once,
+        whether surfaces receive the cloud's light, and the cloud that of the surfaces. Light that goes back and forth more than twice,
         and light from one surface to another, are left out.
     mode
         ``"fast"``: J is predicted at a sparse set of points and interpolated, samples are spent until the noise is as asked; or
@@ -329,12 +331,13 @@ class Renderer:
                 network.stop = interrupted
             if adaptive and self._interreflection:
                 frame.prepare_thrown(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
-            if self._interreflection:
+            for turn in range(_TURNS if self._interreflection else 0):
                 clock = time.perf_counter()
-                reflectors = Reflectors(frame.thrower, lights, frame.seed & 0xFFFFFFFF, frame.counts)
+                reflectors = Reflectors(frame.thrower, lights, frame.on_cloud, (frame.seed + turn) & 0xFFFFFFFF, frame.counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
-                frame.prepare_thrown_back(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
+                if turn == 0 or math.isinf(until):
+                    frame.prepare_thrown_back(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
             if self.mode == "fast" and not frame.sampled:
                 frame.prepare(_INTERPOLATION * error, corrected=correct, until=until)
         except Stopped:

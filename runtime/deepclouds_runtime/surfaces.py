@@ -169,15 +169,17 @@ class Reflectors:
     ----------
     cloud, lights
         what dims the light on its way to the surfaces, and the lights.
+    on_cloud
+        what lights the cloud, whose own light the surfaces send back.
     seed
         32 bits, of the table's random numbers.
     counts
         is updated.
     """
 
-    def __init__(self, cloud: Cloud, lights: Lights, seed: int, counts: Counts) -> None:
+    def __init__(self, cloud: Cloud, lights: Lights, on_cloud: Lights, seed: int, counts: Counts) -> None:
         self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
-        colours, thrown = self._probe(seed, counts)
+        colours, thrown = self._probe(on_cloud, seed, counts)
         self._table = Environment(self._types, self._nothing, colours, uniform=_PROBE_UNIFORM)
         self._thrown = [lanes_of(self._types.Float, thrown[:, c]) for c in range(thrown.shape[1])]
         self.sample, self.density, self.beams = self._table.sample, self._table.density, self._table.beams
@@ -203,7 +205,7 @@ class Reflectors:
     def _nothing(self, direction: Any) -> list[Any]:
         return [dr.zeros(self._types.Float, dr.width(direction)) for _ in self._cloud.albedo]
 
-    def _probe(self, seed: int, counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _probe(self, on_cloud: Lights, seed: int, counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Colour (rows, columns, channels) of the surfaces around the box's middle; the cloud's light they send (cells, channels)."""
         types: ModuleType = self._types
         rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
@@ -226,7 +228,7 @@ class Reflectors:
             interaction = self._seen(dr.zeros(types.Array3f, n) + middle, direction)
             dr.eval(interaction)
             direct = reflected(self._cloud, self._lights, interaction, numbers)
-            sent = reflected_from_cloud(self._cloud, self._lights, interaction, dr.full(types.Float, 1, n), numbers, counts)
+            sent = reflected_from_cloud(self._cloud, on_cloud, interaction, dr.full(types.Float, 1, n), numbers, counts)
             colours += on_host([a + b for a, b in zip(direct, sent, strict=True)], n)
             thrown += on_host(sent, n)
         return colours.reshape(rows, columns, -1) / _PROBE_PARTS, thrown / _PROBE_PARTS
