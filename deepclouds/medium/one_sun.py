@@ -30,7 +30,7 @@ _WALK, _SHADOW, _BRANCH, _BRANCH_SHADOW = range(4)
 
 
 class Escapes:
-    """Where `count` walks leave the cloud, all on the device.
+    """Where `count` walks leave the cloud, and where they found the sun, all on the device.
 
     Attributes
     ----------
@@ -41,11 +41,15 @@ class Escapes:
     weight
         one Float for each albedo: radiance that comes from there, times the weight and the albedo of the walk's first point, is J; 0 of
         walks that did not collide again, and of those that were ended.
+    sunlit
+        (n,) points in the unit cube of the box: of all vertices that a walk was connected at, one, drawn in proportion to what it found
+        there. Whatever else stands between it and the sun multiplies what the whole walk found. Only kept where it is asked for.
     """
 
     def __init__(self, types: Any, count: int, albedos: int) -> None:
         self.position, self.direction = dr.zeros(types.Array3f, count), dr.zeros(types.Array3f, count)
         self.weight = [dr.zeros(types.Float, count) for _ in range(albedos)]
+        self.sunlit = dr.zeros(types.Array3f, count)
 
 
 def trace_one_sun(
@@ -102,6 +106,7 @@ def trace_to_escape(
     lanes: int = 4096,
     varying: AlbedoField | None = None,
     watched: bool = True,
+    shaded: bool = False,
 ) -> tuple[NDArray[np.float32], Escapes]:
     """Walks, one a point, under one sun or none, and where they leave the cloud: there each sees light from all around.
 
@@ -116,6 +121,8 @@ def trace_to_escape(
         point itself taken out alone, and m is the number of its channels.
     watched
         whether anybody asks for the escapes; those that nobody asks for all have weight 0.
+    shaded
+        whether anybody asks for `Escapes.sunlit`.
 
     Returns
     -------
@@ -132,8 +139,8 @@ def trace_to_escape(
     toward = np.broadcast_to(np.array([0, 0, 1], np.float32), (n, 3)) if suns is None else suns
     job = _Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
     escapes = Escapes(types, n, m_albedos)
-    dr.make_opaque(escapes.position, escapes.direction, escapes.weight)
-    kind = _Kind(varying, suns is not None, escapes if watched else None)
+    dr.make_opaque(escapes.position, escapes.direction, escapes.weight, escapes.sunlit)
+    kind = _Kind(varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None)
     _loop(field, _Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
     return np.array(job.result).reshape(n, m_albedos), escapes
 
@@ -146,15 +153,16 @@ class _Kind:
         varying: AlbedoField | None = None,
         sunlit: bool = True,
         escapes: Escapes | None = None,
+        drawn: Any = None,
     ) -> None:
-        self.varying, self.sunlit, self.escapes = varying, sunlit, escapes
+        self.varying, self.sunlit, self.escapes, self.drawn = varying, sunlit, escapes, drawn
 
 
 @dr.syntax
 def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     types = field.types
     result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
-    varying, escapes = kind.varying, kind.escapes
+    varying, escapes, drawn = kind.varying, kind.escapes, kind.drawn
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     m_albedos = len(queries.albedos)
     walks_each = dr.opaque(UInt32, job.walks)
@@ -182,6 +190,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     found = [dr.zeros(Float, lanes) for _ in range(m_albedos)]  # of the walk so far
     # Albedo where a branch has landed, if it varies; else the weight has it already.
     of_branch_end = [dr.full(Float, 1, lanes) for _ in range(m_albedos if varying is not None else 0)]
+    # One of the connected vertices, where it is asked for: its place, and its share of what it found by albedo.
+    vertex = [dr.zeros(Float, lanes) for _ in range(3 if drawn is not None else 0)]
+    parts = [dr.zeros(Float, lanes) for _ in range(m_albedos if drawn is not None else 0)]
 
     scattered = dr.full(Bool, False, lanes)  # has collided since its first point
     left = dr.full(Bool, False, lanes)  # has left the cloud after that
@@ -191,6 +202,13 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     while alive:
         # As in `trace_walks`: lanes that have ended wait for a common turn.
         if ended & (clock % _TURN == 0):
+            if drawn is not None:
+                # Reservoir sampling (Chao 1982): with the probability of its part the vertex stands for all of them.
+                total = _sum(found)
+                for m in range(m_albedos):
+                    found[m] = total * parts[m]
+                for i in range(3):
+                    dr.scatter(drawn[i], vertex[i], number, number < limit)
             for m in range(m_albedos):
                 dr.scatter(result, found[m], number * m_albedos + m, number < limit)
                 found[m] = Float(0)
@@ -261,11 +279,20 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             toward_sun = _phase(lobes, dr.dot(direction, sun))
             of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
             lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
+            arriving = [value * weight[m] for m in range(m_albedos)]
             for m in range(m_albedos):
-                arriving = value * weight[m]
                 if varying is not None:
-                    arriving *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
-                found[m] += dr.select(lit, arriving, 0)
+                    arriving[m] *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
+                found[m] += dr.select(lit, arriving[m], 0)
+            if drawn is not None:
+                here, all_so_far = _sum(arriving), _sum(found)
+                rng, u_drawn = _uniform(types, rng)
+                chosen = lit & (u_drawn * all_so_far < here)
+                place = dr.select(task == _BRANCH_SHADOW, landing, position)
+                for i in range(3):
+                    vertex[i] = dr.select(chosen, place[i], vertex[i])
+                for m in range(m_albedos):
+                    parts[m] = dr.select(chosen, arriving[m] / dr.maximum(here, 1e-30), parts[m])
             # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connection.
             shadow = collision & (u_event * majorant < sigma * (often * of_vertex))
             leaving = begun | (collision & ~shadow) | (over & (task == _SHADOW))
@@ -301,3 +328,10 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         task = dr.select(shadow, UInt32(_SHADOW), dr.select(branch, UInt32(_BRANCH), dr.select(landed, UInt32(_BRANCH_SHADOW), task)))
         task = dr.select(turn, UInt32(_WALK), task)
         begun = Bool(False)
+
+
+def _sum(values: list[Any]) -> Any:
+    total = values[0]
+    for value in values[1:]:
+        total = total + value
+    return total

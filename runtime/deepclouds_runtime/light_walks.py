@@ -53,7 +53,7 @@ class LightWalks:
                 self._bright.append(_OfBright(source, part))
         self._connected: list[_Connected] = []
         if not smooth:
-            self._connected += [_OfSun(sun, lights.shade) for sun in lights.suns if max(sun.irradiance) > 0]
+            self._connected += [_OfSun(sun) for sun in lights.suns if max(sun.irradiance) > 0]
             self._connected += self._bright
         self.lights = len(self._connected) + len(lights.sources)
 
@@ -106,7 +106,7 @@ class LightWalks:
             column = [albedos.index(a) if a > 0 else 0 for a in cloud.albedo]
         else:
             albedos, column = (), list(range(len(cloud.albedo)))
-        toward, arriving = (None, np.zeros((n, len(column)))) if light is None else light.arriving(types, points, random)
+        toward, arriving = (None, np.zeros((n, len(column)))) if light is None else light.arriving(types, n, random)
         j, escapes = trace_to_escape(
             cloud.field,
             points.astype(np.float32),
@@ -117,13 +117,28 @@ class LightWalks:
             key & 0xFFFFFFFF,
             varying=cloud.varying,
             watched=bool(self._lights.sources),
+            shaded=self._lights.shade.surfaces is not None,
         )
+        if toward is not None and self._lights.shade.surfaces is not None:
+            arriving = arriving * self._unshaded(escapes.sunlit, toward)[:, None]
         seen = self._seen(escapes, n, key)
         result = np.zeros((n, len(column)))
         for c, m in enumerate(column):
             # The next collision's albedo is in the walk where it varies.
             next_one = own[:, c] if cloud.varying is None else 1.0
             result[:, c] = own[:, c] * (arriving[:, c] * next_one * j[:, m] / (4 * math.pi * share) + seen[m][:, c])
+        return result
+
+    def _unshaded(self, unit: Any, toward: Array) -> Array:
+        """Whether no surface stands between points, given in the unit cube of the box, and what lies toward (n, 3): (n,)."""
+        types = self._cloud.field.types
+        visible = self._lights.shade.visible(vectors_of(types, self._world(unit)), vectors_of(types, toward))
+        return np.broadcast_to(np.array(visible), len(toward))
+
+    def _world(self, unit: Any) -> Array:
+        """World points (n, 3) of points given in the unit cube of the box."""
+        m = self._cloud.field.volume.to_world
+        result: Array = rows(unit).astype(np.float64) @ m[:3, :3].T + m[:3, 3]
         return result
 
     def _seen(self, escapes: Escapes, n: int, key: int) -> list[Array]:
@@ -138,9 +153,7 @@ class LightWalks:
             return result
         take = taker(types, lanes)
         direction, where = take(escapes.direction), np.array(lanes)
-        m = self._cloud.field.volume.to_world
-        unit = rows(take(escapes.position)).astype(np.float64)
-        x = vectors_of(types, unit @ m[:3, :3].T + m[:3, 3])
+        x = vectors_of(types, self._world(take(escapes.position)))
         one = dr.opaque(types.UInt32, 1)
         total = np.zeros((len(lanes), channels))
         for number, (source, _) in enumerate(self._lights.sources):
@@ -205,24 +218,21 @@ class _Connected(Protocol):
 
     power: float
 
-    def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
-        """Directions (n, 3) TOWARD the light, one a walk, and the irradiance (n, channels) at the points from there."""
+    def arriving(self, types: Any, n: int, random: np.random.Generator) -> tuple[Array, Array]:
+        """Directions (n, 3) TOWARD the light, one a walk, and the irradiance (n, channels) from there where nothing is in the way."""
         ...
 
 
 class _OfSun:
     """A sun."""
 
-    def __init__(self, sun: Sun, shade: Shade) -> None:
-        self._sun, self._shade = sun, shade
+    def __init__(self, sun: Sun) -> None:
+        self._sun = sun
         self.power = max(sun.irradiance)
 
-    def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
-        n = len(points)
-        omega = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in self._sun.omega_sun))
-        visible = np.broadcast_to(np.array(self._shade.visible(vectors_of(types, points), omega)), n)
+    def arriving(self, types: Any, n: int, random: np.random.Generator) -> tuple[Array, Array]:
         toward = np.broadcast_to(np.array(self._sun.omega_sun, np.float32), (n, 3))
-        return toward, visible[:, None] * np.array(self._sun.irradiance, np.float64)
+        return toward, np.broadcast_to(np.array(self._sun.irradiance, np.float64), (n, len(self._sun.irradiance)))
 
 
 class _OfBright:
@@ -231,11 +241,10 @@ class _OfBright:
     def __init__(self, of: Environment, part: BrightPart) -> None:
         self.of, self.part, self.power = of, part, part.irradiance
 
-    def arriving(self, types: Any, points: Array, random: np.random.Generator) -> tuple[Array, Array]:
-        n = len(points)
+    def arriving(self, types: Any, n: int, random: np.random.Generator) -> tuple[Array, Array]:
         u, v = (np.minimum((np.argsort(random.random(n)) + random.random(n)) / n, 1 - 1e-7) for _ in range(2))
         omega, density = self.part.light.sample(*(lanes_of(types.Float, t) for t in (u, v)))
         # A direction at a cell's edge may fall into the next one, which escapes see.
-        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.seen(vectors_of(types, points), omega)]
+        light = [dr.select(self.part.holds(omega), value / density, 0) for value in self.of.radiance(omega)]
         dr.eval(omega, light)
         return np.broadcast_to(rows(omega), (n, 3)), on_host(light, n)

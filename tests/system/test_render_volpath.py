@@ -36,6 +36,12 @@ BALL = (
     '<shape type="sphere"><point name="center" value="0.9, 0.2, 1.2"/><float name="radius" value="0.4"/>'
     '<bsdf type="twosided"><bsdf type="plastic"/></bsdf></shape>'
 )
+# Across the sun's way, so that half of the cloud is in its shade.
+WALL = (
+    '<shape type="rectangle"><transform name="to_world"><scale value="1.5"/><translate x="1.5"/>'
+    '<lookat origin="0.8, 1.6, 1.28" target="0, 0, 0" up="0, 0, 1"/></transform>'
+    '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></bsdf></shape>'
+)
 
 
 @dataclass(frozen=True)
@@ -73,10 +79,12 @@ SCENES = {
     "varying albedo": Scene(SUN, varying=True),
     "varying albedo under a map": Scene(MAP, varying=True, g=-0.3),
     "varying albedo, single": Scene(SUN + CONSTANT, varying=True, max_depth=2),
-    "varying albedo over a floor": Scene(SUN, FLOOR.format(0.5), varying=True, slack=0.01),
+    "varying albedo over a floor": Scene(SUN, FLOOR.format(0.5), varying=True, slack=0.005),
+    "varying albedo half in the shade": Scene(SUN, WALL, varying=True, spp=512),
     "dark floor": Scene(SUN, FLOOR.format(0.0)),
-    "floor": Scene(SUN, FLOOR.format(0.5), slack=0.01),
-    "floor under a map": Scene(MAP, FLOOR.format(0.5), slack=0.01),
+    "floor": Scene(SUN, FLOOR.format(0.5), slack=0.005),
+    "floor under a map": Scene(MAP, FLOOR.format(0.5), slack=0.005),
+    "half in the shade": Scene(SUN, WALL, spp=384),
 }
 
 
