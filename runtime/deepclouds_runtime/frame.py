@@ -358,7 +358,7 @@ class Frame:
         images = []
         for sample in range(2):
             started = time.perf_counter()
-            trial.add(pixels, sample, 1, 4)
+            trial.add(pixels, sample, 1, 2)
             spent = time.perf_counter() - started
             images.append(trial.film.sums()[pixels])
         self.spent("trial", clock)
@@ -393,7 +393,10 @@ class Frame:
         progress: Callable[[float], None] | None,
         interrupted: Callable[[], bool] | None = None,
     ) -> bool:
-        """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all; returns whether it was interrupted."""
+        """Take `samples` more samples of every pixel, numbered from `first` on, of `most` in all, 0 for as many as it will take.
+
+        Returns whether it was interrupted; without a number of samples there is no `progress`.
+        """
         total = len(self._adaptive.active)
         pixels = max(1, (_SLOW_PASS if self.sampled else _PASS) // samples)
         for start in range(0, total, pixels):
@@ -415,7 +418,7 @@ class Frame:
         return dr.opaque(self.types.UInt32, self.seed & 0xFFFFFFFF)
 
     def add(self, pixels: NDArray[np.uint32], sample: int, samples: int, most: int) -> None:
-        """Render the pixels of these numbers, `samples` samples each from number `sample` of `most` on."""
+        """Render the pixels of these numbers, `samples` samples each from number `sample` of `most` on, see `round`."""
         types, scene = self.types, self.scene
         n = len(pixels) * samples
         self.counts.camera_samples += n

@@ -279,7 +279,7 @@ class Renderer:
         if adaptive and not walks and partial is not None:
             clock = time.perf_counter()
             look = self._quick_look(frame, lights)
-            look.round(0, 1, most, None)
+            look.round(0, 1, 1, None)
             partial(self._result(look, started, None, False))
             frame.counts.queries += look.counts.queries
             frame.spent("quick look", clock)
@@ -287,7 +287,7 @@ class Renderer:
         by = math.inf if time_limit is None else started + (_PREDICTION if correct else _PREDICTION_ALONE) * time_limit
         if not self._prepared(frame, lights, error, correct, interrupted, by):
             look = self._quick_look(frame, lights)
-            look.round(0, 1, most, None)
+            look.round(0, 1, 1, None)
             return self._result(look, started, None, False)
         if adaptive and not sampled and (audit or correct):
             until = math.inf

@@ -78,7 +78,7 @@ def rounds_for_error(
         who is told, and the image so far from its noise.
     """
     started, noise, growth = time.perf_counter(), math.inf, 2.0
-    frame.round(0, 1, most, None)
+    frame.round(0, 1, 0, None)
     pace = max(time.perf_counter() - started, 1e-6)
     while frame.samples < most and (target is None or not noise <= target):
         if watch.stops:
@@ -93,7 +93,7 @@ def rounds_for_error(
         if watch.partial is not None:
             watch.partial(so_far(noise))
         clock = time.perf_counter()
-        if frame.round(done, more, most, None, watch.interrupted):
+        if frame.round(done, more, 0, None, watch.interrupted):
             return noise, True
         pace = max(time.perf_counter() - clock, 1e-6) / more
         noise, growth = frame.settle(before, done, error, rest)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 # Fractional parts of the square roots of primes (Richtmyer 1951), as 32-bit fixed-point steps, so that long sequences keep their digits;
@@ -30,6 +31,8 @@ _STEPS = tuple(
     LENS_V,
 ) = range(len(_STEPS))
 DEPTH = len(_STEPS)
+# The step of `DEPTH` where it is not known how many samples there will be: the golden ratio's.
+_DEPTH_STEP = round(0.6180339887498949 * 2**32)
 _DIMENSIONS = DEPTH + 1
 
 
@@ -38,7 +41,7 @@ class Stratified:
 
     Within a pixel, dimension `d` of sample `i` is ``frac(i * step_d + r)`` with a random shift ``r`` of the pixel and the dimension: each
     number is uniform, and those of a pixel are evenly spread (Cranley and Patterson 1976). `DEPTH` is stratified outright,
-    ``(i + r) / count``.
+    ``(i + r) / count``, where the number of samples is known.
 
     Parameters
     ----------
@@ -47,7 +50,7 @@ class Stratified:
     pixel, sample
         number of the pixel, and of the sample within it, of every lane.
     count
-        samples of a pixel.
+        samples of a pixel; 0 where there may be any number of them.
     seed
         32 bits; another seed gives independent shifts.
     """
@@ -64,7 +67,10 @@ class Stratified:
             return _unit(self._types, _hash(u32, mixed))
         shift = _hash(u32, self._pixel ^ _hash(u32, self._seed + u32(0x9E3779B9) * (dimension + 1)))
         if dimension == DEPTH:
-            return (self._types.Float(self._sample) + _unit(self._types, shift)) / self._types.Float(self._count)
+            # The first of many would all lie at the near end.
+            open_ended = _unit(self._types, self._sample * u32(_DEPTH_STEP) + shift)
+            outright = (self._types.Float(self._sample) + _unit(self._types, shift)) / self._types.Float(dr.maximum(self._count, 1))
+            return dr.select(self._count == 0, open_ended, outright)
         index = self._sample * parts + part
         return _unit(self._types, index * u32(_STEPS[dimension]) + shift)
 
@@ -80,8 +86,6 @@ class Stratified:
 
     def several(self, count: int) -> Stratified:
         """Numbers for `count` lanes in place of each, which continue the same sequences."""
-        import drjit as dr
-
         u32 = self._types.UInt32
         many = dr.opaque(u32, count)
         lane = dr.arange(u32, dr.width(self._pixel, self._sample) * count)
@@ -93,8 +97,6 @@ class Stratified:
 
     def take(self, lanes: Any) -> Stratified:
         """The same numbers for the lanes with these indices only."""
-        import drjit as dr
-
         pixel, sample = (dr.gather(self._types.UInt32, values, lanes) for values in (self._pixel, self._sample))
         taken = Stratified(self._types, pixel, sample, self._count, self._seed)
         taken._spread = self._spread

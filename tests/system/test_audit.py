@@ -135,6 +135,9 @@ def test_light_on_surfaces_is_that_of_paths_and_corrected_by_a_factor(floor: Pat
     # Sixteen samples a pixel know a quarter of the floor, with the edge of the shadow in it, to a percent.
     many = rendered(floor, monkeypatch, "none", spp=256)
     np.testing.assert_allclose(_on_floor(many), _on_floor(paths), rtol=0.02)
+    # The dial does not know how many samples it will take.
+    dialled = rendered(floor, monkeypatch, "none", spp=None, error=0.02)
+    assert _on_floor(dialled).sum() == pytest.approx(_on_floor(paths).sum(), rel=0.01)
     # Walks at nodes know what the floor sends without the network: what that errs in the sun's light is corrected.
     for kind in ("none", "constant"):
         walked = rendered(floor, monkeypatch, kind, correct=True, spp=256)
