@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from deepclouds.errors import InputError
 from deepclouds.exr import read_attributes
 from deepclouds.volume import Volume, write_vol
+from tests.system.smooth_network import Smooth
 
 Array = NDArray[Any]
 SIZE = 24
@@ -135,9 +136,6 @@ def test_light_on_surfaces_is_that_of_paths_and_corrected_by_a_factor(floor: Pat
     # Sixteen samples a pixel know a quarter of the floor, with the edge of the shadow in it, to a percent.
     many = rendered(floor, monkeypatch, "none", spp=256)
     np.testing.assert_allclose(_on_floor(many), _on_floor(paths), rtol=0.02)
-    # The dial does not know how many samples it will take.
-    dialled = rendered(floor, monkeypatch, "none", spp=None, error=0.02)
-    assert _on_floor(dialled).sum() == pytest.approx(_on_floor(paths).sum(), rel=0.01)
     # Walks at nodes know what the floor sends without the network: what that errs in the sun's light is corrected.
     for kind in ("none", "constant"):
         walked = rendered(floor, monkeypatch, kind, correct=True, spp=256)
@@ -153,6 +151,17 @@ def test_light_on_surfaces_is_that_of_paths_and_corrected_by_a_factor(floor: Pat
     off, left = (abs(_on_floor(a).sum() / _on_floor(b).sum() - 1) for a, b in ((wrong, found), (constant, right)))
     assert off > 0.01
     assert left < 0.3 * off
+
+
+def test_the_dial_throws_as_much_light_as_a_given_number_of_samples(floor: Path) -> None:
+    """It does not know how many samples it will take: no number may be spread over all of them."""
+
+    def thrown(spp: int | None) -> float:
+        """The cloud's light on the floor."""
+        images = [load(floor, predictor=Smooth(), interreflection=cast).render(spp, 2, error=0.02) for cast in (True, False)]
+        return float(_on_floor(images[0]).sum() - _on_floor(images[1]).sum())
+
+    assert thrown(None) == pytest.approx(thrown(64), rel=0.15)
 
 
 def test_a_network_that_is_right_stays_as_it_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
