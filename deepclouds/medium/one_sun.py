@@ -204,7 +204,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         if ended & (clock % _TURN == 0):
             if drawn is not None:
                 # Reservoir sampling (Chao 1982): with the probability of its part the vertex stands for all of them.
-                total = _sum(found)
+                total = sum(found[1:], found[0])
                 for m in range(m_albedos):
                     found[m] = total * parts[m]
                 for i in range(3):
@@ -285,7 +285,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                     arriving[m] *= dr.select(task == _BRANCH_SHADOW, of_branch_end[m], 1)
                 found[m] += dr.select(lit, arriving[m], 0)
             if drawn is not None:
-                here, all_so_far = _sum(arriving), _sum(found)
+                here, all_so_far = sum(arriving[1:], arriving[0]), sum(found[1:], found[0])
                 rng, u_drawn = _uniform(types, rng)
                 chosen = lit & (u_drawn * all_so_far < here)
                 place = dr.select(task == _BRANCH_SHADOW, landing, position)
@@ -328,10 +328,3 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         task = dr.select(shadow, UInt32(_SHADOW), dr.select(branch, UInt32(_BRANCH), dr.select(landed, UInt32(_BRANCH_SHADOW), task)))
         task = dr.select(turn, UInt32(_WALK), task)
         begun = Bool(False)
-
-
-def _sum(values: list[Any]) -> Any:
-    total = values[0]
-    for value in values[1:]:
-        total = total + value
-    return total
