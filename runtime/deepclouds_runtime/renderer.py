@@ -296,9 +296,10 @@ class Renderer:
                 now = time.perf_counter()
                 left = started + time_limit - now
                 if one > _DEAR * left:
-                    frame.on_cloud = replace(frame.on_cloud, sources=tuple((source, 1) for source, _ in frame.on_cloud.sources))
+                    sources = frame.on_cloud.sources
                     # Shadow rays toward the environment are most of what a sample costs.
-                    one /= self.environment_directions if frame.on_cloud.sources else 1
+                    one /= max((count for _, count in sources), default=1)
+                    frame.on_cloud = replace(frame.on_cloud, sources=tuple((source, 1) for source, _ in sources))
                 spare = left - one
                 until = now + min(max(left - all_of_them, _AUDIT[0] * spare), _AUDIT[1] * spare)
             frame.audit(correct, 0.0 if timed else error, until, interrupted)
