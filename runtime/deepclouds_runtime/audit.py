@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from deepclouds_runtime.audit_walks import Batch, Rays, Walks
+from deepclouds_runtime.camera import Window
 from deepclouds_runtime.correction import FLOOR, GROUPS, Correction, Sums
 from deepclouds_runtime.frame_source import FrameSource
 from deepclouds_runtime.octree import Array
 from deepclouds_runtime.transport import Cloud, Lights
 
-# Regions along the longer side of an image.
+# Regions along the longer side of what shows the cloud.
 _REGIONS = 24
 # Regions darker than this share of the brightest ones do not count.
 _DARK = 0.02
@@ -29,8 +30,8 @@ _LOOKED_AT = 1 << 16
 # Walks of a round, after which somebody is asked whether to go on. The first is judged, which costs as much as tracing some hundred
 # thousand; the next judgement follows when all that may be spent are there.
 ROUND = 1 << 18
-# Walks by default: so many a pixel, within these limits.
-WALKS_A_PIXEL, FEWEST, MOST = 4, 1 << 18, 1 << 22
+# Walks by default: so many a pixel of the image, or of what shows the cloud if these are fewer, within these limits.
+WALKS_A_PIXEL, WALKS_A_SIGHT, FEWEST, MOST = 4, 32, 1 << 18, 1 << 22
 # Where what is left may still be so many times what was asked for, walks go on to so many times their number.
 _FAR, _FURTHER = 1.25, 3
 # Standard deviations of an interval of 95 %.
@@ -74,24 +75,25 @@ class Audit:
 
     Parameters
     ----------
-    cloud, lights, sources, rays, size, seed
+    cloud, lights, sources, rays, window, met, seed
         see `deepclouds_runtime.audit_walks.Walks`; `sources` is what is audited.
     """
 
-    def __init__(self, cloud: Cloud, lights: Lights, sources: Sequence[FrameSource], rays: Rays, size: tuple[int, int], seed: int) -> None:
-        self._walks = Walks(cloud, lights, sources, rays, size, seed)
-        self._sources, self._size = sources, size
+    def __init__(
+        self, cloud: Cloud, lights: Lights, sources: Sequence[FrameSource], rays: Rays, window: Window, met: float, seed: int
+    ) -> None:
+        self._walks = Walks(cloud, lights, sources, rays, window, met, seed)
+        self._sources, self._window = sources, window
         self._sums: Sums | None = None
         self._looked_at: list[tuple[Array, Array, Array, Array]] = []
-        width, height = size
-        self._side = max(1, math.ceil(max(width, height) / _REGIONS))
-        y, x = np.divmod(np.arange(width * height), width)
-        self._area = np.bincount(self._region(y * width + x)) / (width * height)
+        self._side = max(1, math.ceil(max(window.width, window.height) / _REGIONS))
+        self._area = np.bincount(self._region(window.pixels(np.arange(window.count)))) * (window.share / window.count)
         self.count = 0
 
     def _region(self, pixels: Array) -> Array:
-        width = self._size[0]
-        region: Array = pixels // width // self._side * -(-width // self._side) + pixels % width // self._side
+        window, width = self._window, self._window.size[0]
+        row, column = pixels // width - window.top, pixels % width - window.left
+        region: Array = row // self._side * -(-window.width // self._side) + column // self._side
         return region
 
     def extend(self, walks: int) -> None:

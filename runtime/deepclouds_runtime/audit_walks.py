@@ -11,6 +11,7 @@ import numpy as np
 
 from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds_runtime import stratified
+from deepclouds_runtime.camera import Window
 from deepclouds_runtime.correction import FLOOR
 from deepclouds_runtime.frame_source import FrameSource, seen_by
 from deepclouds_runtime.light_walks import LightWalks
@@ -20,8 +21,10 @@ from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, Lights
 
 Rays = Callable[[Any, Stratified], tuple[Any, Any, Any]]
-# Collisions of a ray that walks may start from, walks for each ray, and the fewest rays.
-_DEPTHS, _WALKS_A_RAY, _LEAST_RAYS = 4, 8, 1 << 13
+# Collisions of a ray that walks may start from, walks for each ray, and the fewest and the most rays.
+_DEPTHS, _WALKS_A_RAY, _LEAST_RAYS, _MOST_RAYS = 4, 8, 1 << 13, 1 << 19
+# Share of the rays that should meet the cloud; where fewer do, there are more of them.
+_MET = 0.2
 # Walks that are in memory together.
 _AT_ONCE = 1 << 18
 
@@ -60,14 +63,19 @@ class Walks:
         J as the image has it.
     rays
         pixels and random numbers -> origin, direction and end of camera rays.
-    size
-        (width, height) of the image, pixels.
+    window
+        outside of which the image shows nothing of the cloud.
+    met
+        about what share of the rays through the window meet the cloud.
     seed
         of all random numbers.
     """
 
-    def __init__(self, cloud: Cloud, lights: Lights, sources: Sequence[FrameSource], rays: Rays, size: tuple[int, int], seed: int) -> None:
-        self._cloud, self._lights, self._sources, self._rays, self._size = cloud, lights, sources, rays, size
+    def __init__(
+        self, cloud: Cloud, lights: Lights, sources: Sequence[FrameSource], rays: Rays, window: Window, met: float, seed: int
+    ) -> None:
+        self._cloud, self._lights, self._sources, self._rays, self._window = cloud, lights, sources, rays, window
+        self._more = max(_MET / max(met, 1e-9), 1.0)
         self._seed = np.random.SeedSequence([seed & 0xFFFFFFFF, 0xA0D17])
         #: J (n, channels) of one walk a point, see `LightWalks`.
         self.walked = LightWalks(cloud, lights)
@@ -85,10 +93,10 @@ class Walks:
         (own,) = self._seed.spawn(1)
         random = np.random.default_rng(own)
         key = int(random.integers(1 << 32))
-        width, height = self._size
-        rays = max(walks // _WALKS_A_RAY, _LEAST_RAYS)
-        chosen = ((np.arange(rays) + random.random(rays)) * (width * height / rays)).astype(np.int64)
-        chosen = np.minimum(chosen, width * height - 1)
+        count = self._window.count
+        rays = max(min(int(walks / _WALKS_A_RAY * self._more), _MOST_RAYS), _LEAST_RAYS)
+        index = ((np.arange(rays) + random.random(rays)) * (count / rays)).astype(np.int64)
+        chosen = self._window.pixels(np.minimum(index, count - 1))
         pixel = lanes_of(types.UInt32, chosen)
         one = dr.opaque(types.UInt32, 1)
         numbers = Stratified(types, pixel, dr.arange(types.UInt32, rays), one, dr.opaque(types.UInt32, key)).unrelated()
@@ -98,7 +106,7 @@ class Walks:
             return None
         along = np.broadcast_to(rows(direction), (rays, 3))
         predicted = predicted_at(self._sources, seen.points)
-        share = seen.weights / rays
+        share = seen.weights * (self._window.share / rays)
         # Walks are noisier where J is larger; some must be left for where the network sees nothing.
         level = predicted.mean(axis=1)
         wanted = share * (level + max(FLOOR * float(np.average(level, weights=share)), 1e-30))

@@ -1,7 +1,9 @@
-"""The camera of a scene: rays through the pixels of its crop window, and the direction in which it sees a point."""
+"""The camera of a scene: rays through the pixels of its crop window, the direction in which it sees a point, and where it shows points."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +14,42 @@ from numpy.typing import NDArray
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.stratified import Stratified
+
+# Places on the edge of a lens that tell how far a point is blurred, and how much further its blur may reach between them.
+_ON_LENS, _BETWEEN = 16, 1.02
+
+
+@dataclass(frozen=True)
+class Window:
+    """Some of an image's columns and rows.
+
+    Attributes
+    ----------
+    left, top, width, height
+        pixels.
+    size
+        (width, height) of the whole image, pixels.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    size: tuple[int, int]
+
+    @property
+    def count(self) -> int:
+        """How many pixels it has."""
+        return self.width * self.height
+
+    @property
+    def share(self) -> float:
+        """Its share of the image."""
+        return self.count / (self.size[0] * self.size[1])
+
+    def pixels(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Numbers in the image of the pixels that have these numbers in the window; both row by row."""
+        return (self.top + index // self.width) * self.size[0] + self.left + index % self.width
 
 
 class Camera:
@@ -64,6 +102,60 @@ class Camera:
         length = np.linalg.norm(away, axis=1, keepdims=True)
         seen: NDArray[np.float64] = np.where(length > 0, away / np.maximum(length, 1e-30), self._forward)
         return seen
+
+    def footprint(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Edge of a pixel as large as it looks at world points (n, 3) in front of the camera: (n,), world."""
+        width, height = self._sensor.film().crop_size()
+        (o, d), (ox, dx), (oy, dy) = (self._ray(place, (0.5, 0.5)) for place in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+        depth = np.maximum((points - o) @ self._forward, 0)[:, None]
+        edges = [np.linalg.norm(side - o + depth * (to - d), axis=1) / n for side, to, n in ((ox, dx, width), (oy, dy, height))]
+        return np.minimum(*edges)
+
+    def window(self, corners: NDArray[np.float64]) -> Window:
+        """The part of the image outside of which it shows nothing of a box with these world corners (8, 3).
+
+        The whole image, where some of the box lies beside or behind the camera, or none is in sight.
+        """
+        size = tuple(int(v) for v in self._sensor.film().crop_size())
+        whole = Window(0, 0, size[0], size[1], (size[0], size[1]))
+        lower, upper = np.full(2, math.inf), np.full(2, -math.inf)
+        for lens in self._lens():
+            # Where a ray begins and where it goes, by a depth of 1, are linear in its place on the film.
+            (o, d), (ox, dx), (oy, dy) = (self._ray(place, lens) for place in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+            for corner in corners:
+                depth = float((corner - o) @ self._forward)
+                if not depth > 0:
+                    return whole
+                across = np.stack([ox - o + depth * (dx - d), oy - o + depth * (dy - d)], axis=1)
+                place = np.linalg.lstsq(across, corner - o - depth * d, rcond=None)[0]
+                lower, upper = np.minimum(lower, place), np.maximum(upper, place)
+        if self._sensor.needs_aperture_sample():
+            middle, half = 0.5 * (lower + upper), 0.5 * _BETWEEN * (upper - lower)
+            lower, upper = middle - half, middle + half
+        # A pixel more on each side for rounding.
+        first = np.clip(np.floor(lower * size) - 1, 0, size).astype(int)
+        last = np.clip(np.ceil(upper * size) + 1, 0, size).astype(int)
+        if not (last > first).all():
+            return whole
+        return Window(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]), (size[0], size[1]))
+
+    def _lens(self) -> list[tuple[float, float]]:
+        """Random numbers of rays from the edge of the lens, or of a ray from the only point there is."""
+        if not self._sensor.needs_aperture_sample():
+            return [(0.5, 0.5)]
+        # The unit square's edge goes to the disc's.
+        along = (np.arange(_ON_LENS) + 0.5) / (_ON_LENS // 4)
+        side, place = along.astype(int), along % 1
+        edge = np.select([side == 0, side == 1, side == 2], [place + 0j, 1 + 1j * place, 1 - place + 1j], 1j * (1 - place))
+        return [(float(u), float(v)) for u, v in zip(edge.real, edge.imag, strict=True)]
+
+    def _ray(self, place: tuple[float, float], lens: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a ray begins, world, and where it goes, as far as makes a depth of 1."""
+        mi = mitsuba()
+        film, aperture = mi.Point2f(*place), mi.Point2f(*lens)
+        ray, _ = self._sensor.sample_ray(mi.Float(self._sensor.shutter_open()), mi.Float(0.5), film, aperture)
+        o, d = (np.array(v, np.float64).reshape(3, -1)[:, 0] for v in (ray.o, ray.d))
+        return o, d / (d @ self._forward)
 
     def distance(self, points: Any) -> Any:
         """Distance of world points (Array3f) from the camera's place, or from its plane where rays are parallel."""

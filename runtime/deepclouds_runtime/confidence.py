@@ -21,7 +21,9 @@ Image = NDArray[np.float32]
 DOUBTFUL, WORTH_A_WORD = 0.25, 0.1
 
 
-def relative_errors(sources: Sequence[FrameSource], seen: Seen, pixels: NDArray[np.uint32], size: tuple[int, int]) -> Image | None:
+def relative_errors(
+    sources: Sequence[FrameSource], seen: Seen, columns: NDArray[np.int64], rows: NDArray[np.int64], size: tuple[int, int]
+) -> Image | None:
     """Error to expect of the multiple scattering in each pixel (h, w), as a share of it; None where the network knows none.
 
     Parameters
@@ -30,31 +32,30 @@ def relative_errors(sources: Sequence[FrameSource], seen: Seen, pixels: NDArray[
         multiple scattering of this camera.
     seen
         what the pilot rays saw.
-    pixels
-        numbers of the rays' pixels, row by row: a regular grid of the image's, from its first one on.
+    columns, rows
+        of the pixels that the rays are from: row by row all of them, once or more often.
     size
         (w, h) of the image.
     """
     if not sources or any(source.doubt is None for source in sources) or not len(seen.points):
         return None
     width, height = size
-    across = pixels[: np.count_nonzero(pixels < width)]
-    down = pixels[:: len(across)] // width
-    light = np.zeros((2, len(down), len(across)))
+    light = np.zeros((2, len(rows), len(columns)))
+    pixels = seen.rays % light[0].size
     for source in sources:
         octree: Any = source.doubt
         types = octree.types
         points = vectors_of(types, seen.points)
         for field, value in zip(light, octree.lookup(octree.to_local(points), types.Bool(True)), strict=True):
-            of_ray = np.bincount(seen.rays, seen.weights * np.array(value, np.float64), len(pixels))
-            field += of_ray.reshape(field.shape)
+            of_pixel = np.bincount(pixels, seen.weights * np.array(value, np.float64), field.size)
+            field += of_pixel.reshape(field.shape)
     # A ray has few collisions, and none where it happens to pass: each takes in those of its neighbours.
     predicted, error = _with_neighbours(light)
     share = np.where(predicted > 0, error / np.maximum(predicted, 1e-30), 0).astype(np.float32)
-    return _between(_between(share, across, width).T, down, height).T
+    return _between(_between(share, columns, width).T, rows, height).T
 
 
-def _between(values: Image, places: NDArray[np.uint32], count: int) -> Image:
+def _between(values: Image, places: NDArray[np.int64], count: int) -> Image:
     """Values (h, n) at n ascending whole `places` as values (h, count) at all places from 0 on, linear between them."""
     at = np.arange(count)
     after = np.clip(np.searchsorted(places, at), 1, max(len(places) - 1, 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
@@ -18,9 +19,9 @@ from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
 from deepclouds_runtime.all_round import AllRound, spread
-from deepclouds_runtime.audit import FEWEST, MOST, ROUND, WALKS_A_PIXEL, Audit, audited
+from deepclouds_runtime.audit import FEWEST, MOST, ROUND, WALKS_A_PIXEL, WALKS_A_SIGHT, Audit, audited
 from deepclouds_runtime.audit_walks import Walks
-from deepclouds_runtime.camera import Camera
+from deepclouds_runtime.camera import Camera, Window
 from deepclouds_runtime.confidence import confidence, relative_errors
 from deepclouds_runtime.disc import background, looks_into
 from deepclouds_runtime.fast import fast_cloud_light
@@ -54,8 +55,8 @@ ERROR = 0.02
 # Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB. Those that end in a query or a walk take long, and
 # an interruption waits for them.
 _PASS, _SLOW_PASS = 1 << 19, 1 << 16
-# Rays that look for what the camera sees, and collisions on each of them.
-_PILOT, _PILOT_DEPTHS = 1 << 16, 4
+# Rays that look for what the camera sees: at most, and where a pixel may have several; and collisions on each of them.
+_PILOT, _PILOT_FEW, _PILOT_DEPTHS = 1 << 16, 1 << 14, 4
 # Most queries for the suns, and as many for the light from all around.
 _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
@@ -66,6 +67,8 @@ _BEAMS_THROWN, _BEAMS_BACK = 12, 4
 _COLLISIONS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 26, 1000.0, 1024
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
+# Edge of the finest cells in pixels, as large as these look at the nearest of what the camera sees, a quantile.
+_FINEST, _NEAR = 1.0, 0.1
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
 # of which sees many places.
 _CORRECTED, _THROWN = 1.6, 4.0
@@ -139,6 +142,10 @@ class Frame:
 
     def __post_init__(self) -> None:
         self.film, self._adaptive = Film(self.scene.size), Adaptive(self.scene.size)
+        # Where the image shows the cloud, and what share of the pilot's rays there met it.
+        to_world = self.cloud.field.volume.to_world
+        corners = np.array(list(itertools.product((0.0, 1.0), repeat=3))) @ to_world[:3, :3].T + to_world[:3, 3]
+        self._window, self._met = self.camera.window(corners), 1.0
 
     def skipped(self) -> dict[str, int]:
         """Queries that were not needed, by reason; a sample counts as the one query that the reference mode would ask."""
@@ -192,7 +199,8 @@ class Frame:
         lower, upper = self.cloud.field.volume.bounds
         middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
         radius = 0.5 * float(np.linalg.norm(upper - lower))
-        pixel, numbers = self._pilot(_PILOT // 8)
+        width, height = self.scene.size
+        pixel, numbers, *_ = self._pilot(Window(0, 0, width, height, (width, height)), _PILOT // 8, 0)
         origin, direction, _ = self.camera.rays(pixel, numbers)
         # What the camera sees of the surfaces, and what the middle of the cloud sees of them: the probe stands there.
         around = spread(_PILOT // 8).astype(np.float32)
@@ -249,14 +257,20 @@ class Frame:
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
-    def _pilot(self, most: int) -> tuple[Any, Stratified]:
-        """Pixels spread over the image, no more than `most`, and random numbers for them."""
-        width, height = self.scene.size
-        stride = math.ceil(math.sqrt(width * height / most))
-        columns, rows = np.arange(0, width, stride), np.arange(0, height, stride)
-        pixel = lanes_of(self.types.UInt32, (rows[:, None] * width + columns).ravel())
-        one = dr.opaque(self.types.UInt32, 1)
-        return pixel, Stratified(self.types, pixel, dr.zeros(self.types.UInt32, len(pixel)), one, self._seed()).unrelated()
+    def _pilot(self, window: Window, most: int, few: int) -> tuple[Any, Stratified, NDArray[np.int64], NDArray[np.int64]]:
+        """Pixels spread over a window, each as often as makes `few` if it can be, and no more than `most`; random numbers for them.
+
+        And the columns and rows that they are from.
+        """
+        types = self.types
+        stride = math.ceil(math.sqrt(window.count / most))
+        columns, rows = np.arange(0, window.width, stride) + window.left, np.arange(0, window.height, stride) + window.top
+        once = (rows[:, None] * window.size[0] + columns).ravel()
+        each = max(few // len(once), 1)
+        pixel = lanes_of(types.UInt32, np.tile(once, each))
+        sample = lanes_of(types.UInt32, np.repeat(np.arange(each), len(once)))
+        numbers = Stratified(types, pixel, sample, dr.opaque(types.UInt32, 1), self._seed()).unrelated()
+        return pixel, numbers, columns, rows
 
     def prepare(self, tolerance: float, quick: bool = False, corrected: bool = False, until: float = math.inf) -> None:
         """Predict multiple scattering for this camera; from then on camera rays ask no network.
@@ -273,9 +287,10 @@ class Frame:
             about when to be done, in seconds of `time.perf_counter`: there are no more nodes than that leaves time for.
         """
         clock = time.perf_counter()
-        pixel, numbers = self._pilot(_PILOT // 4 if quick else _PILOT)
+        pixel, numbers, columns, rows = self._pilot(self._window, *((_PILOT // 4, 0) if quick else (_PILOT, _PILOT_FEW)))
         origin, direction, end = self._camera_rays(pixel, numbers)
         seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
+        self._met = len(seen.points) / (_PILOT_DEPTHS * dr.width(pixel))
         self.spent("pilot", clock)
         clock = time.perf_counter()
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
@@ -297,19 +312,20 @@ class Frame:
         of_suns, of_around = (tolerance / math.sqrt(max(part / max(sum(parts), 1e-30), 1e-6)) for part in parts)
         of_suns *= _CORRECTED if corrected else 1.0
         eyes, first = [self.camera], part_of_time(until, 0.5) if around or walks is not None else until
+        finest = _FINEST * float(np.quantile(self.camera.footprint(seen.points), _NEAR)) if len(seen.points) else 0.0
         found = {
-            "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first),
+            "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first, finest=finest),
         }
         if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
             how = seen, _ROOT_AROUND, of_around, walks.most, self.seed
-            found["light from all around"] = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until)
+            around_it = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until, finest=finest)
         else:
-            found["light from all around"] = frame_source(
-                self._roughly, around, eyes, seen, wide * _ROOT_AROUND, of_around, _BUDGET, until=until
-            )
+            root = wide * _ROOT_AROUND
+            around_it = frame_source(self._roughly, around, eyes, seen, root, of_around, _BUDGET, until=until, finest=finest)
+        found["light from all around"] = around_it
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
-        self.errors = relative_errors(self.sources, seen, np.array(pixel), self.scene.size)
+        self.errors = relative_errors(self.sources, seen, columns, rows, self.scene.size)
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
 
@@ -322,11 +338,12 @@ class Frame:
             _LOG.info("no time was left to measure the network's error, or to correct it")
             return
         width, height = self.scene.size
-        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, (width, height), self.seed)
+        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, self._window, self._met, self.seed)
         most, at_once, of_thrown = _MOST_TIMED, _TIMED_ROUND, _WALKS_THROWN // 4
         if math.isinf(until):
             # Walks are as noisy as any path: half of the error takes four times as many.
-            most = int(np.clip(WALKS_A_PIXEL * width * height * (ERROR / error) ** 2, FEWEST, MOST))
+            usual = min(WALKS_A_PIXEL * width * height, WALKS_A_SIGHT * self._met * self._window.count)
+            most = int(np.clip(usual * (ERROR / error) ** 2, FEWEST, MOST))
             at_once, of_thrown = ROUND, _WALKS_THROWN
 
         def more(seconds: float) -> bool:
@@ -334,7 +351,7 @@ class Frame:
 
         thrown = None
         if correct and self.all_round is not None and more(_LEAST_THROWN):
-            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, (width, height), self.seed)
+            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, self._window, self._met, self.seed)
             thrown = self.all_round.correct(walks, of_thrown, self.seed)
         outcome = audited(found, self.sources, correct, error, most, more, at_once)
         self.sources, self.found = outcome.sources, outcome.found
@@ -351,10 +368,12 @@ class Frame:
         # Not what the film smooths: of that a few samples know little. It takes about as long again, and a few more of them.
         smoothed = self.film.thrown is not None
         trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False)
+        # Samples that meet nothing cost next to nothing.
         width, height = self.scene.size
-        y, x = np.divmod(np.arange(width * height, dtype=np.uint32), np.uint32(width))
-        apart = 4 if width * height > _MANY_PIXELS else 2
-        pixels = np.flatnonzero((x // 8 % apart == 0) & (y // 8 % apart == 0)).astype(np.uint32)
+        window = self._window if self.scene.surfaces is None else Window(0, 0, width, height, (width, height))
+        y, x = np.divmod(np.arange(window.count), window.width)
+        apart = 4 if window.count > _MANY_PIXELS else 2
+        pixels = window.pixels(np.flatnonzero((x // 8 % apart == 0) & (y // 8 % apart == 0))).astype(np.uint32)
         images = []
         for sample in range(2):
             started = time.perf_counter()
@@ -364,7 +383,7 @@ class Frame:
         self.spent("trial", clock)
         first, mean = images[0], 0.5 * images[1]
         lit = mean > DARK * np.quantile(mean, 0.999)
-        of_one = _SLOWER * spent * width * height / len(pixels)
+        of_one = _SLOWER * spent * window.count / len(pixels)
         if not lit.any():
             return of_one, of_one
         noise = float(np.sqrt(np.mean(np.square((mean - first)[lit]))) / mean[lit].mean())

@@ -244,6 +244,7 @@ def frame_source(
     combine: Callable[[Array], Array] = operator.itemgetter(0),
     every: int = 1,
     until: float = math.inf,
+    finest: float = 0.0,
 ) -> FrameSource | None:
     """J of a frame; None where it is 0 everywhere.
 
@@ -268,6 +269,8 @@ def frame_source(
         of so many fields the first is a value of J; the others may have any sign.
     until
         about when to be done, in seconds of `time.perf_counter`: there are no more nodes than should be ready by then.
+    finest
+        edge, world, below which cells are not split: what an eye can tell apart.
     """
     network = cloud.scattering
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
@@ -276,7 +279,7 @@ def frame_source(
     predicted = _Predicted(cloud, network, lights, albedos, eyes, combine)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     checks = max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes)))
-    return interpolated(cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until)
+    return interpolated(cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until, finest=finest)
 
 
 class Evaluates(Protocol):
@@ -313,12 +316,13 @@ def interpolated(
     every: int = 1,
     until: float = math.inf,
     overdrawn: int = _OVERDRAWN,
+    finest: float = 0.0,
 ) -> FrameSource:
     """What `evaluate` says at the nodes of an octree, interpolated.
 
     Parameters
     ----------
-    field, seen, root, tolerance, every, until
+    field, seen, root, tolerance, every, until, finest
         as for `frame_source`.
     network
         has the unit of length, and what nodes are aligned to.
@@ -339,13 +343,16 @@ def interpolated(
     parts = [paced(part) for part in np.array_split(held_out.points, 1 if math.isinf(until) else 2) if len(part)]
     true = np.concatenate(parts) if parts else np.empty((0, 0))
     spacing, most = root * network.descriptor.unit, min(overdrawn * nodes, max(paced.affordable(), _LEAST_CORNERS))
+    # Splits between the coarsest cells and the finest that anybody can tell apart; where these are the larger ones, all are as large.
+    levels = _LEVELS if finest == 0 else math.floor(math.log2(spacing / finest) + 1)
+    spacing, levels = spacing * 2.0 ** max(-levels, 0), min(max(levels, 0), _LEVELS)
     while True:
         lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
         corners = root_nodes(lattice, seen.points, most)
         if corners <= most or lattice.size.max() <= 2:
             break
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
-    octree = Octree(lattice, paced, built_for.points, built_for.weights, tolerance, nodes, _LEVELS, evaluate.carried, paced.affordable)
+    octree = Octree(lattice, paced, built_for.points, built_for.weights, tolerance, nodes, levels, evaluate.carried, paced.affordable)
     device = octree.upload(field.types)
     factor, error = _audit(device, true, held_out, every)
     doubt = octree.upload(field.types, carried=True) if evaluate.carried else None

@@ -43,12 +43,13 @@ def walked_source(
     combine: Callable[[Array], Array] = operator.itemgetter(0),
     every: int = 1,
     until: float = math.inf,
+    finest: float = 0.0,
 ) -> FrameSource | None:
     """J of a frame under the lights of `walks`; None where the camera sees no cloud, or it is black.
 
     Parameters
     ----------
-    cloud, eyes, seen, root, tolerance, combine, every, until
+    cloud, eyes, seen, root, tolerance, combine, every, until, finest
         see `deepclouds_runtime.frame_source.frame_source`.
     network
         has the unit of length, and knows whether to give up, by `Stopped`; it is not asked.
@@ -65,7 +66,7 @@ def walked_source(
     if len(eyes) == 1:
         found.choose(seen)
     nodes, checks = most // (found.each * len(eyes)), max(_LEAST_CHECKS, _CHECKS // len(eyes))
-    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until, 1)
+    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until, 1, finest)
 
 
 class _Walked:

@@ -7,6 +7,7 @@ correction brings the image nearer to one by walks, images stay positive, and on
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deepclouds_runtime import correction, frame
+from deepclouds_runtime.audit_walks import Batch, Walks
 from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
@@ -162,6 +164,57 @@ def test_the_dial_throws_as_much_light_as_a_given_number_of_samples(floor: Path)
         return float(_on_floor(images[0]).sum() - _on_floor(images[1]).sum())
 
     assert thrown(None) == pytest.approx(thrown(64), rel=0.15)
+
+
+def _from_afar(scene: Path, size: int) -> Path:
+    """The same scene, a tenth as large in an image of so many pixels."""
+    path = scene.with_name(f"far{size}.xml")
+    text = scene.read_text().replace(f'value="{SIZE}"', f'value="{size}"').replace('origin="1.2, 1, 3.6"', 'origin="12, 10, 36"')
+    path.write_text(text)
+    return path
+
+
+def test_a_cloud_far_away_is_corrected_as_well(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven pixels of a thousand show it: rays through all of them would start every walk at the same few points."""
+    far = _from_afar(scene, 240)
+    starts = []
+    batches = Walks.batches
+
+    def watched(self: Walks, walks: int) -> Iterator[Batch]:
+        for batch in batches(self, walks):
+            starts.append(batch.points)
+            yield batch
+
+    monkeypatch.setattr(Walks, "batches", watched)
+    true, wrong, right = (
+        rendered(far, monkeypatch, kind, **how) for kind, how in (("exact", {}), ("smooth", {}), ("smooth", {"correct": True}))
+    )
+    shown = true.rgb.sum(axis=2) > 0
+    assert 50 < shown.sum() < 500
+    points = np.concatenate(starts)
+    assert len(np.unique(points, axis=0)) > len(points) // 64
+
+    def error(image: RenderResult) -> float:
+        return float(np.sqrt(np.mean((image.rgb - true.rgb)[shown] ** 2)) / true.rgb[shown].mean())
+
+    # What is left is the noise of single pixels.
+    assert error(right) < 0.6 * error(wrong)
+    assert abs(right.rgb.sum() / true.rgb.sum() - 1) < 0.01
+    found = right.statistics.audit
+    low, high = found["remaining"]["energy_interval"]
+    assert low < 0 < high
+    assert high - low < 0.03
+
+
+def test_nodes_are_no_finer_than_pixels(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    far = _from_afar(scene, 2 * SIZE)
+    found = rendered(far, monkeypatch, "none", error=0.005)
+    shown = int((found.rgb.sum(axis=2) > 0).sum())
+    assert found.statistics.sources["suns"]["nodes"] < 20 * shown
+    monkeypatch.setattr(frame, "_FINEST", 1e-9)
+    finer = rendered(far, monkeypatch, "none", error=0.005)
+    assert finer.statistics.sources["suns"]["nodes"] > 4 * found.statistics.sources["suns"]["nodes"]
+    assert found.rgb.sum() == pytest.approx(finer.rgb.sum(), rel=0.01)
 
 
 def test_a_network_that_is_right_stays_as_it_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,3 +80,62 @@ def test_a_crop_window_has_the_rays_of_its_pixels(mi: Any, kind: str) -> None:
     rows, columns = np.divmod(np.arange(6), 3)
     for a, b in zip(_rays(mi, crop, np.arange(6)), _rays(mi, whole, (rows + 1) * WIDTH + columns + 2), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+BOX = np.array([(x, y, z) for x in (-0.4, 0.1) for y in (-0.2, 0.5) for z in (-0.3, 0.6)])
+FINE = {"width": 140, "height": 100}
+
+
+def _meets(
+    origin: NDArray[np.float64], direction: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> NDArray[Any]:
+    with np.errstate(divide="ignore"):
+        ends = np.stack([(lower - origin) / direction, (upper - origin) / direction])
+    met: NDArray[Any] = ends.min(axis=0).max(axis=1) < ends.max(axis=0).min(axis=1)
+    return met
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "crop", [{}, {"crop_width": 70, "crop_height": 30, "crop_offset_x": 60, "crop_offset_y": 20}], ids=["whole", "crop"]
+)
+def test_what_shows_a_box_lies_in_its_window(mi: Any, kind: str, crop: dict[str, int]) -> None:
+    camera = _camera(mi, kind, **FINE, **crop)
+    window = camera.window(BOX)
+    width, height = window.size
+    assert (width, height) == (crop.get("crop_width", 140), crop.get("crop_height", 100))
+    pixels = np.repeat(np.arange(width * height), 16)
+    origin, direction = _rays(mi, camera, pixels)
+    row, column = np.divmod(pixels[_meets(origin, direction, BOX[0], BOX[-1])], width)
+    assert len(row) > 1000
+    assert window.left <= column.min()
+    assert column.max() < window.left + window.width
+    assert window.top <= row.min()
+    assert row.max() < window.top + window.height
+    # And little more: a pixel and a part of one on each side, and where only the blur of the box's corner reaches.
+    slack = 6 if kind == "thinlens" else 4
+    assert window.width <= np.ptp(column) + 1 + slack
+    assert window.height <= np.ptp(row) + 1 + slack
+    index = np.arange(window.count)
+    there = window.pixels(index)
+    np.testing.assert_array_equal(there % width, window.left + index % window.width)
+    np.testing.assert_array_equal(there // width, window.top + index // window.width)
+    assert window.share == pytest.approx(window.count / (width * height))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_box_around_or_out_of_sight_has_the_whole_image(mi: Any, kind: str) -> None:
+    camera = _camera(mi, kind, **FINE)
+    away = PLACE / np.linalg.norm(PLACE)
+    for corners in (BOX + PLACE, BOX + 2 * PLACE, 40 * BOX, BOX + 60 * np.cross(away, (0, 1, 0))):
+        assert camera.window(corners).count == 140 * 100
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_footprint_is_as_far_as_the_next_pixel_sees(mi: Any, kind: str) -> None:
+    camera = _camera(mi, kind, **FINE)
+    axis = -PLACE / np.linalg.norm(PLACE)
+    depths = np.array([2.0, 5.0, 9.0])
+    found = camera.footprint(PLACE + depths[:, None] * axis)
+    expected = np.full(3, 2 * 1.5 / 140) if kind == "orthographic" else depths * 2 * np.tan(np.radians(20)) / 140
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
