@@ -22,7 +22,7 @@ from deepclouds_runtime.octree import Array
 from deepclouds_runtime.transport import Cloud, Lights
 
 # Regions along the longer side of what shows the cloud.
-_REGIONS = 24
+_REGIONS = 20
 # Regions darker than this share of the brightest ones do not count.
 _DARK = 0.02
 # Points at which a correction is looked at to judge it.

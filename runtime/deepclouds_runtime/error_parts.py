@@ -12,7 +12,7 @@ AVERAGED = 0.2
 
 def error_parts(
     noise: float | None,
-    points: Iterable[float],
+    points: Iterable[tuple[float, float]],
     indirect: float,
     asked: bool,
     audit: Mapping[str, Any],
@@ -26,7 +26,7 @@ def error_parts(
     noise
         of a pixel, as estimated; None where it was not.
     points
-        errors of the interpolation at a point, one for each source of multiple scattering.
+        error of the interpolation at a point, over the mean, and this mean, of each source of multiple scattering.
     indirect
         share of interpolated light in all light of the image.
     asked
@@ -45,8 +45,10 @@ def error_parts(
     tells what it is a share of. ``by`` is "none" where no network was asked; "walks" of the audit; "expectation", from what it knows of its
     errors for such inputs; "validation", on held-out clouds and not on this one; or "unknown".
     """
-    at_points = [float(p) for p in points]
-    interpolation = AVERAGED * indirect * max(at_points) if at_points else None
+    parts = [(float(error), float(level)) for error, level in points]
+    total = sum(level for _, level in parts)
+    at_points = math.hypot(*(error * level for error, level in parts)) / total if total > 0 else 0.0
+    interpolation = AVERAGED * indirect * at_points if parts else None
     both = None if noise is None else math.hypot(noise, interpolation or 0.0)
     return {
         "sampling": noise,

@@ -69,6 +69,10 @@ _COLLISIONS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 26, 1000.0, 1024
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Edge of the finest cells in pixels, as large as these look at the nearest of what the camera sees, a quantile.
 _FINEST, _NEAR = 1.0, 0.1
+# A cloud is thin that hides less than this of what is behind it. There it is seen first what share of the image's light was scattered more
+# than once, by so many walks and pixels: below so much of the error of interpolation aimed at, none of it is rendered, and below a half
+# its errors may be larger, so many times at most.
+_THIN, _TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 0.5, 4096, 0.04, 0.5, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
 # of which sees many places.
 _CORRECTED, _THROWN = 1.6, 4.0
@@ -146,6 +150,8 @@ class Frame:
         to_world = self.cloud.field.volume.to_world
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=3))) @ to_world[:3, :3].T + to_world[:3, 3]
         self._window, self._met = self.camera.window(corners), 1.0
+        # What an error of multiple scattering is in the image, of a thin cloud; 1 of others.
+        self._weight = 1.0
 
     def skipped(self) -> dict[str, int]:
         """Queries that were not needed, by reason; a sample counts as the one query that the reference mode would ask."""
@@ -290,8 +296,17 @@ class Frame:
         pixel, numbers, columns, rows = self._pilot(self._window, *((_PILOT // 4, 0) if quick else (_PILOT, _PILOT_FEW)))
         origin, direction, end = self._camera_rays(pixel, numbers)
         seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
-        self._met = len(seen.points) / (_PILOT_DEPTHS * dr.width(pixel))
+        rays = dr.width(pixel)
+        self._met = len(seen.points) / (_PILOT_DEPTHS * rays)
         self.spent("pilot", clock)
+        if not quick and float(seen.weights.sum()) < _THIN * self._met * rays:
+            share = self._share(seen, rays)
+            if share < _NEGLIGIBLE * tolerance:
+                _LOG.info("multiple scattering is %.2g %% of the image's light: single scattering alone is rendered", 100 * share)
+                self.sources, self.named = [], {}
+                return
+            self._weight = min(max(share / _LARGE, 1 / _MOST_SPARED), 1.0)
+            tolerance /= self._weight
         clock = time.perf_counter()
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
@@ -329,6 +344,25 @@ class Frame:
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
 
+    def _share(self, seen: Seen, rays: int) -> float:
+        """Share of multiple scattering in the light of the image, by walks from what so many `rays` have `seen`, and a few samples."""
+        clock = time.perf_counter()
+        if not len(seen.points):
+            return 0.0
+        random = np.random.default_rng([self.seed & 0xFFFFFFFF, 0x54A2])
+        total = np.cumsum(seen.weights)
+        drawn = np.minimum(np.searchsorted(total, (np.arange(_TRIED) + random.random()) / _TRIED * total[-1]), len(total) - 1)
+        points = seen.points[drawn]
+        j = LightWalks(self.cloud, self.on_cloud)(points, self.camera.toward(points), random)
+        multiple = float(j.mean()) * total[-1] / rays * self._window.share
+        width, height = self.scene.size
+        pixels = np.unique(np.linspace(0, width * height - 1, _TRIED).astype(np.uint32))
+        trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False, sources=[], depths=1)
+        trial.add(pixels, 0, 1, 1)
+        other = float(trial.film.sums()[pixels].mean())
+        self.spent("trial", clock)
+        return float(multiple / max(multiple + other, 1e-30))
+
     def audit(self, correct: bool, error: float, until: float, interrupted: Callable[[], bool] | None) -> None:
         """Audit the sources, and correct them, with walks, until about the time `until`."""
         if not self.sources:
@@ -338,6 +372,7 @@ class Frame:
             _LOG.info("no time was left to measure the network's error, or to correct it")
             return
         width, height = self.scene.size
+        error /= self._weight
         found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, self._window, self._met, self.seed)
         most, at_once, of_thrown = _MOST_TIMED, _TIMED_ROUND, _WALKS_THROWN // 4
         if math.isinf(until):
@@ -394,7 +429,7 @@ class Frame:
 
     def noise_goal(self, error: float) -> float:
         """Noise of a pixel that makes an error together with what walks have left of the network's; at least `_LEAST_NOISE` of it."""
-        left = self.found["remaining"]["error"] if self.found.get("corrected") else 0.0
+        left = self._weight * self.found["remaining"]["error"] if self.found.get("corrected") else 0.0
         return error * math.sqrt(max(1 - (left / error) ** 2, _LEAST_NOISE**2))
 
     def _camera_rays(self, pixel: Any, numbers: Stratified) -> tuple[Any, Any, Any]:

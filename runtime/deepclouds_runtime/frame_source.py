@@ -57,6 +57,8 @@ class FrameSource:
         what it took.
     error
         of the interpolation at a point that the camera sees, measured: root of the mean square over the mean.
+    level
+        this mean, over all channels.
     queries
         asked of the network.
     lights
@@ -78,6 +80,7 @@ class FrameSource:
     model: str = ""
     doubt: DeviceOctree | None = None
     built: Octree | None = None
+    level: float = 1.0
 
     def corrected(self, correction: Callable[[Array], Array], floor: Array, points: Array, weights: Array) -> FrameSource:
         """J + (J + floor) d in the place of J, with d = correction(world points), as well as the nodes can have it; nowhere below 0.
@@ -354,9 +357,12 @@ def interpolated(
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
     octree = Octree(lattice, paced, built_for.points, built_for.weights, tolerance, nodes, levels, evaluate.carried, paced.affordable)
     device = octree.upload(field.types)
-    factor, error = _audit(device, true, held_out, every)
+    factor, error, means = _audit(device, true, held_out, every)
+    level = float(means @ evaluate.mix.mean(axis=0)) if len(means) == evaluate.mix.shape[1] else 1.0
     doubt = octree.upload(field.types, carried=True) if evaluate.carried else None
-    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, evaluate.queries, lights, evaluate.model, doubt, octree)
+    return FrameSource(
+        device, evaluate.mix * factor, octree.statistics, error, evaluate.queries, lights, evaluate.model, doubt, octree, level
+    )
 
 
 def part_of_time(until: float, share: float) -> float:
@@ -501,20 +507,20 @@ def _split(seen: Seen, count: int) -> tuple[Seen, Seen]:
     return Seen(seen.points[chosen], np.ones(count), seen.rays[chosen]), Seen(seen.points[rest], seen.weights[rest], seen.rays[rest])
 
 
-def _audit(octree: DeviceOctree, values_there: Array, checks: Seen, every: int) -> tuple[float, float]:
+def _audit(octree: DeviceOctree, values_there: Array, checks: Seen, every: int) -> tuple[float, float, Array]:
     """Compare interpolated with true values (n, fields and more) at n points that the camera sees.
 
     A cloud is bright where it is dense, and nodes lie anywhere: interpolation is a little too dark. Returns the factor that makes up for it
-    on the mean, and the error that remains at a point, root of the mean square over the mean.
+    on the mean, the error that remains at a point, root of the mean square over the mean, and the true mean of every field.
     """
     if not len(checks.points):
-        return 1.0, 0.0
+        return 1.0, 0.0, np.empty(0)
     true = values_there[:, : octree.fields].astype(np.float64)[:, ::every]
     values = octree.lookup(octree.to_local(vectors_of(octree.types, checks.points)), octree.types.Bool(True))
     dr.eval(values)
     interpolated = np.stack([np.array(v, np.float64) for v in values[::every]], axis=1)
     if not (true.sum() > 0 and interpolated.sum() > 0):
-        return 1.0, 0.0
+        return 1.0, 0.0, true.mean(axis=0)
     factor = float(true.sum() / interpolated.sum())
     error = float(np.sqrt(np.mean(np.square(factor * interpolated - true))) / true.mean())
-    return factor, error
+    return factor, error, true.mean(axis=0)

@@ -387,7 +387,7 @@ class Renderer:
         indirect = sum(float(channels[f"volume_indirect.{c}"].sum(dtype=np.float64)) for c in COLOURS)
         statistics.error = error_parts(
             statistics.noise,
-            [source.error for source in frame.sources or []],
+            [(source.error, source.level) for source in frame.sources or []],
             indirect / whole if whole > 0 else 0.0,
             self._network is not None,
             frame.found,

@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of, vectors_of
 from deepclouds.medium.optical_depth import optical_depth
-from deepclouds.medium.phase import rotate_to
+from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
 from deepclouds_runtime.disc import Disc, discs
 from deepclouds_runtime.lights import Beam, Environment, LightSource, directions_of_cells, on_host
+from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 
+# Of the rays that look for light of the cloud, those toward suns at most; the peak of a phase function that gets half of them; and what
+# is not worth the while.
+_MOST_HALO, _PEAK, _LEAST_HALO = 0.4, 6.0, 0.05
 _PROBE_ROWS = 32
 _PROBE_PARTS = 4
 # A sample beside the middle sees lit surfaces where the middle sees the cloud's own shadow: many directions ignore the table.
@@ -108,8 +112,8 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
 
     Notes
     -----
-    The ray's direction comes from the BSDF or, as often, from the cone around the sphere that encloses the cloud's box; both are
-    weighted by the density of the mixture (Veach and Guibas 1995).
+    The ray's direction comes from the BSDF or, as often, from the cone around the sphere that encloses the cloud's box; or from the phase
+    function around a sun, which thin cloud has a bright halo about. All are weighted by the density of the mixture (Veach and Guibas 1995).
     """
     mi, types = mitsuba(), cloud.field.types
     context = mi.BSDFContext()
@@ -125,19 +129,26 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
 
     pick = numbers.number(stratified.SURFACE_W)
     u, v = numbers.number(stratified.SURFACE_U), numbers.number(stratified.SURFACE_V)
-    aim = pick < 0.5
-    rest = dr.minimum(dr.select(aim, 2 * pick, 2 * pick - 1), 0.99999994)
+    halo = _halo(cloud, lights)
+    of_halo = halo.share if halo is not None else 0.0
+    half = 0.5 * (1 - of_halo)
+    aim, bounce = pick < half, (pick >= half) & (pick < 2 * half)
+    rest = dr.clip((pick - half) / half, 0, 0.99999994)
     # Around the axis: cosine uniform between that of the cone's edge and 1.
     aimed = rotate_to(axis, 1 - u * (1 - widest), 2 * dr.pi * v)
     sample, sampled = bsdf.sample(context, interaction, mi.Float(rest), mi.Point2f(u, v), valid)
     omega = dr.select(aim, aimed, plain(types, interaction.to_world(sample.wo)))
+    if halo is not None:
+        omega = dr.select(aim | bounce, omega, halo.sample(dr.clip((pick - 2 * half) / of_halo, 0, 0.99999994), u, v))
     local = interaction.to_local(mi.Vector3f(omega))
-    density = 0.5 * plain(types, bsdf.pdf(context, interaction, local, valid)) + dr.select(dr.dot(omega, axis) >= widest, 0.5 * of_cone, 0)
-    # A mirror's direction has no density: it is taken as often as the BSDF is asked, half of the time.
-    mirror = ~aim & plain(types, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
+    density = half * (plain(types, bsdf.pdf(context, interaction, local, valid)) + dr.select(dr.dot(omega, axis) >= widest, of_cone, 0))
+    if halo is not None:
+        density += of_halo * halo.density(omega)
+    # A mirror's direction has no density: it is taken as often as the BSDF is asked.
+    mirror = bounce & plain(types, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
     smooth = channels(types, bsdf.eval(context, interaction, local, valid))
     throughput = [
-        dr.select(mirror, 2 * direct, dr.select(density > 0, value / dr.maximum(density, 1e-20), 0))
+        dr.select(mirror, direct / half, dr.select(density > 0, value / dr.maximum(density, 1e-20), 0))
         for direct, value in zip(channels(types, sampled), smooth, strict=True)
     ]
     most = throughput[0]
@@ -145,8 +156,46 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
         most = dr.maximum(most, value)
     ray = interaction.spawn_ray(mi.Vector3f(omega))
     end = plain(types, lights.shade.surfaces.ray_intersect(ray).t)
-    light = cloud_light(cloud, lights, plain(types, ray.o), omega, end, numbers, counts, dr.select(plain(types, valid), most * weight, 0))
+    # What the image has of cloud samples are those of its own rays.
+    own = Counts()
+    light = cloud_light(cloud, lights, plain(types, ray.o), omega, end, numbers, own, dr.select(plain(types, valid), most * weight, 0))
+    counts.queries += own.queries
+    counts.skipped += own.skipped
     return [t * (s + j) for t, s, j in zip(throughput, light.direct, light.indirect, strict=True)]
+
+
+class _Halo:
+    """Directions around suns, spread as the phase function spreads their light."""
+
+    def __init__(self, types: Any, suns: list[Sun], lobe: tuple[float, float, float], share: float) -> None:
+        self._types, self.share = types, share
+        self._lobe = [dr.opaque(types.Float, v) for v in lobe]
+        power = np.array([max(sun.irradiance) for sun in suns])
+        self._until = [dr.opaque(types.Float, float(v)) for v in np.cumsum(power / power.sum())]
+        self._parts = [dr.opaque(types.Float, float(v)) for v in power / power.sum()]
+        self._suns = [types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun)) for sun in suns]
+
+    def sample(self, pick: Any, u: Any, v: Any) -> Any:
+        """Unit vectors (Array3f) by numbers in [0, 1): of the sun, and of the place around it."""
+        axis = self._suns[-1]
+        for sun, until in zip(self._suns[-2::-1], self._until[-2::-1], strict=True):
+            axis = dr.select(pick < until, sun, axis)
+        return rotate_to(axis + 0 * pick, sample_two_lobe_cosine(u, *self._lobe), 2 * dr.pi * v)
+
+    def density(self, omega: Any) -> Any:
+        """Their density, 1/sr."""
+        terms = [part * two_lobe(dr.dot(omega, sun), *self._lobe) for part, sun in zip(self._parts, self._suns, strict=True)]
+        return sum(terms[1:], terms[0])
+
+
+def _halo(cloud: Cloud, lights: Lights) -> _Halo | None:
+    """None where there are no suns, or the phase function has no peak."""
+    suns = [sun for sun in lights.suns if max(sun.irradiance) > 0]
+    g = cloud.phase[0]
+    # Relative variance of the peak under directions drawn evenly, beside which all other noise is about 1.
+    peak = (1 + g * g) / (1 - g * g) ** 2 - 1
+    share = _MOST_HALO * peak / (peak + _PEAK)
+    return _Halo(cloud.field.types, suns, cloud.phase, share) if suns and share > _LEAST_HALO else None
 
 
 def diffuse_share(types: Any, interaction: Any) -> tuple[list[Any], Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -13,11 +14,11 @@ METRICS = {"all.rrmse": 0.18, "all.rrmse_low": 0.1, "all.rrmse_high": 0.3}
 
 
 def test_samples_and_interpolation_add_up() -> None:
-    parts = error_parts(0.03, [0.1, 0.4], 0.5, True, {}, {}, {})
+    parts = error_parts(0.03, [(0.1, 1.0), (0.4, 3.0)], 0.5, True, {}, {}, {})
     assert parts["sampling"] == 0.03
-    assert parts["interpolation"] == pytest.approx(AVERAGED * 0.5 * 0.4)
-    assert parts["both"] == pytest.approx(0.05)
-    assert in_words(parts)[0] == "noise of a pixel 3 %, interpolation 4 %, together 5 %"
+    assert parts["interpolation"] == pytest.approx(AVERAGED * 0.5 * math.hypot(0.1, 1.2) / 4)
+    assert parts["both"] == pytest.approx(math.hypot(0.03, parts["interpolation"]))
+    assert in_words(parts)[0] == "noise of a pixel 3 %, interpolation 3 %, together 4.2 %"
     once = error_parts(None, [], 0.0, True, {}, {}, {})
     assert (once["both"], once["interpolation"]) == (None, None)
     assert in_words(once)[0] == "noise unknown (one round of samples)"
@@ -37,7 +38,7 @@ def test_samples_and_interpolation_add_up() -> None:
 def test_the_networks_part_is_by_the_best_that_is_known(
     audit: dict[str, Any], expected: dict[str, float], metrics: dict[str, float], by: str, said: str
 ) -> None:
-    parts = error_parts(0.02, [0.05], 0.7, True, audit, expected, metrics)
+    parts = error_parts(0.02, [(0.05, 1.0)], 0.7, True, audit, expected, metrics)
     assert parts["network"]["by"] == by
     assert in_words(parts)[1].startswith(said)
 
