@@ -38,7 +38,7 @@ from deepclouds_runtime.frame_source import (
     part_of_time,
     seen_by,
 )
-from deepclouds_runtime.light_walks import BRIGHT, LightWalks
+from deepclouds_runtime.light_walks import BRIGHT, LightWalks, Paths
 from deepclouds_runtime.lights import Environment, LightSource
 from deepclouds_runtime.result import Image
 from deepclouds_runtime.scattering import NetworkScattering
@@ -150,6 +150,9 @@ class Frame:
         to_world = self.cloud.field.volume.to_world
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=3))) @ to_world[:3, :3].T + to_world[:3, 3]
         self._window, self._met = self.camera.window(corners), 1.0
+        self._pilot_saw: tuple[Seen, int, NDArray[np.int64], NDArray[np.int64]] | None = None
+        # What finds J of the light that a thin cloud throws on surfaces.
+        self._paths: Paths | None = None
         # What an error of multiple scattering is in the image, of a thin cloud; 1 of others.
         self._weight = 1.0
 
@@ -172,6 +175,8 @@ class Frame:
     @property
     def thrower(self) -> Cloud:
         """The cloud as surfaces see it."""
+        if self._paths is not None:
+            return replace(self.cloud, scattering=None, paths=self._paths, exact=1)
         return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
 
     def _walked(
@@ -200,9 +205,14 @@ class Frame:
         tolerance, corrected, until
             see `prepare`.
         """
-        clock = time.perf_counter()
         types = self.types
         lower, upper = self.cloud.field.volume.bounds
+        if corrected and self._thin:
+            # Of it next to all was scattered once or twice and goes on about as the sun's light does, which few directions tell nothing of.
+            self._paths = Paths(self.cloud.field, self.cloud.albedo, self.cloud.phase, self.cloud.varying, self.seed)
+            self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
+            return
+        clock = time.perf_counter()
         middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
         radius = 0.5 * float(np.linalg.norm(upper - lower))
         width, height = self.scene.size
@@ -278,6 +288,24 @@ class Frame:
         numbers = Stratified(types, pixel, sample, dr.opaque(types.UInt32, 1), self._seed()).unrelated()
         return pixel, numbers, columns, rows
 
+    def _looked(self, quick: bool = False) -> tuple[Seen, int, NDArray[np.int64], NDArray[np.int64]]:
+        """What the pilot's rays see of the cloud, how many they are, and the columns and rows that they are from."""
+        if self._pilot_saw is None:
+            clock = time.perf_counter()
+            pixel, numbers, columns, rows = self._pilot(self._window, *((_PILOT // 4, 0) if quick else (_PILOT, _PILOT_FEW)))
+            origin, direction, end = self._camera_rays(pixel, numbers)
+            seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
+            self._pilot_saw = seen, dr.width(pixel), columns, rows
+            self._met = len(seen.points) / (_PILOT_DEPTHS * dr.width(pixel))
+            self.spent("pilot", clock)
+        return self._pilot_saw
+
+    @property
+    def _thin(self) -> bool:
+        """Whether the cloud hides little of what is behind it where the camera sees it."""
+        seen, rays, *_ = self._looked()
+        return 0 < float(seen.weights.sum()) < _THIN * self._met * rays
+
     def prepare(self, tolerance: float, quick: bool = False, corrected: bool = False, until: float = math.inf) -> None:
         """Predict multiple scattering for this camera; from then on camera rays ask no network.
 
@@ -292,14 +320,8 @@ class Frame:
         until
             about when to be done, in seconds of `time.perf_counter`: there are no more nodes than that leaves time for.
         """
-        clock = time.perf_counter()
-        pixel, numbers, columns, rows = self._pilot(self._window, *((_PILOT // 4, 0) if quick else (_PILOT, _PILOT_FEW)))
-        origin, direction, end = self._camera_rays(pixel, numbers)
-        seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
-        rays = dr.width(pixel)
-        self._met = len(seen.points) / (_PILOT_DEPTHS * rays)
-        self.spent("pilot", clock)
-        if not quick and float(seen.weights.sum()) < _THIN * self._met * rays:
+        seen, rays, columns, rows = self._looked(quick)
+        if not quick and self._thin:
             share = self._share(seen, rays)
             if share < _NEGLIGIBLE * tolerance:
                 _LOG.info("multiple scattering is %.2g %% of the image's light: single scattering alone is rendered", 100 * share)
@@ -512,7 +534,9 @@ class Frame:
             colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
             if self.interreflection:
                 weight = dr.select(shown, through, 0)
-                thrown = reflected_from_cloud(self.thrower, self.on_cloud, interaction, weight, numbers, self.counts)
+                thrown = reflected_from_cloud(
+                    self.thrower, self.on_cloud, interaction, weight, numbers, Counts() if self._paths is not None else self.counts
+                )
                 if self.film.thrown is not None:
                     share, matt = diffuse_share(types, interaction)
                     lit, even = ([value * through for value in values] for values in (thrown, share))
