@@ -106,10 +106,11 @@ class Camera:
     def footprint(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Edge of a pixel as large as it looks at world points (n, 3) in front of the camera: (n,), world."""
         width, height = self._sensor.film().crop_size()
-        (o, d), (ox, dx), (oy, dy) = (self._ray(place, (0.5, 0.5)) for place in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+        ((o, ox, oy), (d, dx, dy)), *_ = self._affine(np.array([[0.5, 0.5]]))
         depth = np.maximum((points - o) @ self._forward, 0)[:, None]
         edges = [np.linalg.norm(side - o + depth * (to - d), axis=1) / n for side, to, n in ((ox, dx, width), (oy, dy, height))]
-        return np.minimum(*edges)
+        edge: NDArray[np.float64] = np.minimum(*edges)
+        return edge
 
     def window(self, corners: NDArray[np.float64]) -> Window:
         """The part of the image outside of which it shows nothing of a box with these world corners (8, 3).
@@ -119,9 +120,7 @@ class Camera:
         size = tuple(int(v) for v in self._sensor.film().crop_size())
         whole = Window(0, 0, size[0], size[1], (size[0], size[1]))
         lower, upper = np.full(2, math.inf), np.full(2, -math.inf)
-        for lens in self._lens():
-            # Where a ray begins and where it goes, by a depth of 1, are linear in its place on the film.
-            (o, d), (ox, dx), (oy, dy) = (self._ray(place, lens) for place in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+        for (o, ox, oy), (d, dx, dy) in self._affine(self._lens()):
             for corner in corners:
                 depth = float((corner - o) @ self._forward)
                 if not depth > 0:
@@ -139,23 +138,30 @@ class Camera:
             return whole
         return Window(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]), (size[0], size[1]))
 
-    def _lens(self) -> list[tuple[float, float]]:
-        """Random numbers of rays from the edge of the lens, or of a ray from the only point there is."""
+    def _lens(self) -> NDArray[np.float64]:
+        """Random numbers (n, 2) of rays from the edge of the lens, or of a ray from the only point there is."""
         if not self._sensor.needs_aperture_sample():
-            return [(0.5, 0.5)]
+            return np.array([[0.5, 0.5]])
         # The unit square's edge goes to the disc's.
         along = (np.arange(_ON_LENS) + 0.5) / (_ON_LENS // 4)
-        side, place = along.astype(int), along % 1
-        edge = np.select([side == 0, side == 1, side == 2], [place + 0j, 1 + 1j * place, 1 - place + 1j], 1j * (1 - place))
-        return [(float(u), float(v)) for u, v in zip(edge.real, edge.imag, strict=True)]
+        side, place = along.astype(int), (along % 1)[:, None]
+        ends = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1], [0, 0]])
+        edge: NDArray[np.float64] = ends[side] * (1 - place) + ends[side + 1] * place
+        return edge
 
-    def _ray(self, place: tuple[float, float], lens: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where a ray begins, world, and where it goes, as far as makes a depth of 1."""
+    def _affine(self, lens: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where rays begin, world, and where they go, as far as makes a depth of 1: both are linear in the place on the film.
+
+        For random numbers (n, 2) of the lens, (n, 2, 3, 3): of begin and way, at the film's first corner and at the two next to it.
+        """
         mi = mitsuba()
-        film, aperture = mi.Point2f(*place), mi.Point2f(*lens)
-        ray, _ = self._sensor.sample_ray(mi.Float(self._sensor.shutter_open()), mi.Float(0.5), film, aperture)
-        o, d = (np.array(v, np.float64).reshape(3, -1)[:, 0] for v in (ray.o, ray.d))
-        return o, d / (d @ self._forward)
+        film = np.tile([[0.0, 0.0], [1, 0], [0, 1]], (len(lens), 1)).astype(np.float32)
+        aperture = np.repeat(lens, 3, axis=0).astype(np.float32)
+        place, through = (mi.Point2f(*(mi.Float(np.ascontiguousarray(values[:, c])) for c in range(2))) for values in (film, aperture))
+        ray, _ = self._sensor.sample_ray(mi.Float(self._sensor.shutter_open()), mi.Float(0.5), place, through)
+        # Parallel rays share one direction.
+        o, d = (np.broadcast_to(np.array(v, np.float64).reshape(3, -1).T, (len(film), 3)) for v in (ray.o, ray.d))
+        return np.stack([o, d / (d @ self._forward)[:, None]], axis=1).reshape(len(lens), 3, 2, 3).transpose(0, 2, 1, 3)
 
     def distance(self, points: Any) -> Any:
         """Distance of world points (Array3f) from the camera's place, or from its plane where rays are parallel."""

@@ -76,6 +76,8 @@ _THIN, _TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 0.5, 4096, 0.04, 0.5, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
 # of which sees many places.
 _CORRECTED, _THROWN = 1.6, 4.0
+# Rays from a sample of a surface that look for this light, where they are short: it is noisier than all else in a sample.
+_RAYS_THROWN = 2
 # Walks that correct the light thrown on surfaces, by a single number.
 _WALKS_THROWN = 1 << 17
 # Collisions of a camera ray that get shadow rays; under suns alone, where these are all that they cost, more: along a ray noise falls with
@@ -321,7 +323,7 @@ class Frame:
             about when to be done, in seconds of `time.perf_counter`: there are no more nodes than that leaves time for.
         """
         seen, rays, columns, rows = self._looked(quick)
-        if not quick and self._thin:
+        if not quick and isinstance(self.cloud.scattering, NetworkScattering) and self._thin:
             share = self._share(seen, rays)
             if share < _NEGLIGIBLE * tolerance:
                 _LOG.info("multiple scattering is %.2g %% of the image's light: single scattering alone is rendered", 100 * share)
@@ -369,8 +371,6 @@ class Frame:
     def _share(self, seen: Seen, rays: int) -> float:
         """Share of multiple scattering in the light of the image, by walks from what so many `rays` have `seen`, and a few samples."""
         clock = time.perf_counter()
-        if not len(seen.points):
-            return 0.0
         random = np.random.default_rng([self.seed & 0xFFFFFFFF, 0x54A2])
         total = np.cumsum(seen.weights)
         drawn = np.minimum(np.searchsorted(total, (np.arange(_TRIED) + random.random()) / _TRIED * total[-1]), len(total) - 1)
@@ -534,9 +534,7 @@ class Frame:
             colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
             if self.interreflection:
                 weight = dr.select(shown, through, 0)
-                thrown = reflected_from_cloud(
-                    self.thrower, self.on_cloud, interaction, weight, numbers, Counts() if self._paths is not None else self.counts
-                )
+                thrown = self._thrown(interaction, weight, numbers)
                 if self.film.thrown is not None:
                     share, matt = diffuse_share(types, interaction)
                     lit, even = ([value * through for value in values] for values in (thrown, share))
@@ -557,6 +555,16 @@ class Frame:
                 self._adaptive.dazzled[pixels] |= np.array(dr.block_sum(dr.select(into, types.Float(1), 0), samples)) > 0
         self.film.add(*where, "A", [alpha])
         self.spent("surfaces and background", clock)
+
+    def _thrown(self, interaction: Any, weight: Any, numbers: Stratified) -> list[Any]:
+        """Light of the cloud that surfaces send back, see `reflected_from_cloud`."""
+        counts = Counts() if self._paths is not None else self.counts
+        thrown = reflected_from_cloud(self.thrower, self.on_cloud, interaction, weight, numbers, counts)
+        rays = _RAYS_THROWN if self.film.thrown is not None else 1
+        for k in range(1, rays):
+            more = reflected_from_cloud(self.thrower, self.on_cloud, interaction, weight, numbers.unrelated(k), counts)
+            thrown = [a + b for a, b in zip(thrown, more, strict=True)]
+        return [value * (1 / rays) for value in thrown]
 
     def _surfaces(self, origin: Any, direction: Any, end: Any) -> tuple[Any, Any, Any]:
         """What the rays hit, where they end, and whether they hit anything."""

@@ -389,7 +389,7 @@ class Renderer:
             statistics.noise,
             [(source.error, source.level) for source in frame.sources or []],
             indirect / whole if whole > 0 else 0.0,
-            self._network is not None,
+            self._network is not None and frame.sources != [],
             frame.found,
             statistics.network,
             getattr(getattr(self.predictor, "metadata", None), "metrics", {}),

@@ -130,7 +130,7 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
     pick = numbers.number(stratified.SURFACE_W)
     u, v = numbers.number(stratified.SURFACE_U), numbers.number(stratified.SURFACE_V)
     halo = _halo(cloud, lights)
-    of_halo = halo.share if halo is not None else 0.0
+    of_halo = 0.0 if halo is None else halo.share
     half = 0.5 * (1 - of_halo)
     aim, bounce = pick < half, (pick >= half) & (pick < 2 * half)
     rest = dr.clip((pick - half) / half, 0, 0.99999994)
@@ -168,7 +168,7 @@ class _Halo:
     """Directions around suns, spread as the phase function spreads their light."""
 
     def __init__(self, types: Any, suns: list[Sun], lobe: tuple[float, float, float], share: float) -> None:
-        self._types, self.share = types, share
+        self._types, self.share = types, dr.opaque(types.Float, share)
         self._lobe = [dr.opaque(types.Float, v) for v in lobe]
         power = np.array([max(sun.irradiance) for sun in suns])
         self._until = [dr.opaque(types.Float, float(v)) for v in np.cumsum(power / power.sum())]

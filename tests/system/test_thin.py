@@ -68,6 +68,7 @@ def test_single_scattering_alone_is_rendered_where_that_is_enough(ball: Path, ca
     assert "single scattering alone" in caplog.text
     assert found.statistics.sources.keys().isdisjoint({"suns", "light from all around"})
     assert found.statistics.audit == {}
+    assert found.statistics.error["network"] == {"by": "none"}
     assert found.channels["volume_indirect.G"].sum() == 0
     assert found.channels["volume_direct.G"].sum() > 0
     paths = load(ball, unbiased=True, defines={"scale": "0.02"}).render(256, 3)
