@@ -37,6 +37,11 @@ class Window:
     height: int
     size: tuple[int, int]
 
+    @classmethod
+    def whole(cls, size: tuple[int, int]) -> Window:
+        """All of an image of (width, height) pixels."""
+        return cls(0, 0, *size, size)
+
     @property
     def count(self) -> int:
         """How many pixels it has."""
@@ -117,14 +122,14 @@ class Camera:
 
         The whole image, where some of the box lies beside or behind the camera, or none is in sight.
         """
-        size = tuple(int(v) for v in self._sensor.film().crop_size())
-        whole = Window(0, 0, size[0], size[1], (size[0], size[1]))
+        width, height = (int(v) for v in self._sensor.film().crop_size())
+        size = width, height
         lower, upper = np.full(2, math.inf), np.full(2, -math.inf)
         for (o, ox, oy), (d, dx, dy) in self._affine(self._lens()):
             for corner in corners:
                 depth = float((corner - o) @ self._forward)
                 if not depth > 0:
-                    return whole
+                    return Window.whole(size)
                 across = np.stack([ox - o + depth * (dx - d), oy - o + depth * (dy - d)], axis=1)
                 place = np.linalg.lstsq(across, corner - o - depth * d, rcond=None)[0]
                 lower, upper = np.minimum(lower, place), np.maximum(upper, place)
@@ -135,8 +140,8 @@ class Camera:
         first = np.clip(np.floor(lower * size) - 1, 0, size).astype(int)
         last = np.clip(np.ceil(upper * size) + 1, 0, size).astype(int)
         if not (last > first).all():
-            return whole
-        return Window(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]), (size[0], size[1]))
+            return Window.whole(size)
+        return Window(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]), size)
 
     def _lens(self) -> NDArray[np.float64]:
         """Random numbers (n, 2) of rays from the edge of the lens, or of a ray from the only point there is."""

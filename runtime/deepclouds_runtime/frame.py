@@ -14,8 +14,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of, vectors_of
-from deepclouds_runtime import stratified
+from deepclouds.backend import vectors_of
+from deepclouds_runtime import pilot
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
 from deepclouds_runtime.all_round import AllRound, spread
@@ -55,8 +55,8 @@ ERROR = 0.02
 # Camera samples in flight: enough to fill the machine, few enough to stay below 1 GB. Those that end in a query or a walk take long, and
 # an interruption waits for them.
 _PASS, _SLOW_PASS = 1 << 19, 1 << 16
-# Rays that look for what the camera sees: at most, and where a pixel may have several; and collisions on each of them.
-_PILOT, _PILOT_FEW, _PILOT_DEPTHS = 1 << 16, 1 << 14, 4
+# Rays that look for what of the surfaces is seen.
+_SURFACE_RAYS = pilot.MOST // 8
 # Most queries for the suns, and as many for the light from all around.
 _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
@@ -69,10 +69,9 @@ _COLLISIONS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 26, 1000.0, 1024
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Edge of the finest cells in pixels, as large as these look at the nearest of what the camera sees, a quantile.
 _FINEST, _NEAR = 1.0, 0.1
-# A cloud is thin that hides less than this of what is behind it. There it is seen first what share of the image's light was scattered more
-# than once, by so many walks and pixels: below so much of the error of interpolation aimed at, none of it is rendered, and below a half
-# its errors may be larger, so many times at most.
-_THIN, _TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 0.5, 4096, 0.04, 0.5, 4.0
+# Of a thin cloud it is seen first what share of the image's light was scattered more than once, by so many walks and pixels: below so much
+# of the error of interpolation aimed at, none of it is rendered, and below a half its errors may be larger, so many times at most.
+_TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 4096, 0.04, 0.5, 4.0
 # Error of the interpolation at a point over what is aimed at: where walks correct it later, and of light thrown on surfaces, each point
 # of which sees many places.
 _CORRECTED, _THROWN = 1.6, 4.0
@@ -148,11 +147,11 @@ class Frame:
 
     def __post_init__(self) -> None:
         self.film, self._adaptive = Film(self.scene.size), Adaptive(self.scene.size)
-        # Where the image shows the cloud, and what share of the pilot's rays there met it.
+        # Where the image shows the cloud, and what is seen of it there.
         to_world = self.cloud.field.volume.to_world
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=3))) @ to_world[:3, :3].T + to_world[:3, 3]
-        self._window, self._met = self.camera.window(corners), 1.0
-        self._pilot_saw: tuple[Seen, int, NDArray[np.int64], NDArray[np.int64]] | None = None
+        self._window = self.camera.window(corners)
+        self._pilot: pilot.Pilot | None = None
         # What finds J of the light that a thin cloud throws on surfaces.
         self._paths: Paths | None = None
         # What an error of multiple scattering is in the image, of a thin cloud; 1 of others.
@@ -209,7 +208,7 @@ class Frame:
         """
         types = self.types
         lower, upper = self.cloud.field.volume.bounds
-        if corrected and self._thin:
+        if corrected and self._looked().thin:
             # Of it next to all was scattered once or twice and goes on about as the sun's light does, which few directions tell nothing of.
             self._paths = Paths(self.cloud.field, self.cloud.albedo, self.cloud.phase, self.cloud.varying, self.seed)
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
@@ -217,11 +216,10 @@ class Frame:
         clock = time.perf_counter()
         middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
         radius = 0.5 * float(np.linalg.norm(upper - lower))
-        width, height = self.scene.size
-        pixel, numbers, *_ = self._pilot(Window(0, 0, width, height, (width, height)), _PILOT // 8, 0)
+        pixel, numbers, *_ = pilot.spread_pixels(types, Window.whole(self.scene.size), _SURFACE_RAYS, 0, self._seed())
         origin, direction, _ = self.camera.rays(pixel, numbers)
         # What the camera sees of the surfaces, and what the middle of the cloud sees of them: the probe stands there.
-        around = spread(_PILOT // 8).astype(np.float32)
+        around = spread(_SURFACE_RAYS).astype(np.float32)
         out = vectors_of(types, around)
         parts = []
         for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
@@ -275,38 +273,13 @@ class Frame:
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
-    def _pilot(self, window: Window, most: int, few: int) -> tuple[Any, Stratified, NDArray[np.int64], NDArray[np.int64]]:
-        """Pixels spread over a window, each as often as makes `few` if it can be, and no more than `most`; random numbers for them.
-
-        And the columns and rows that they are from.
-        """
-        types = self.types
-        stride = math.ceil(math.sqrt(window.count / most))
-        columns, rows = np.arange(0, window.width, stride) + window.left, np.arange(0, window.height, stride) + window.top
-        once = (rows[:, None] * window.size[0] + columns).ravel()
-        each = max(few // len(once), 1)
-        pixel = lanes_of(types.UInt32, np.tile(once, each))
-        sample = lanes_of(types.UInt32, np.repeat(np.arange(each), len(once)))
-        numbers = Stratified(types, pixel, sample, dr.opaque(types.UInt32, 1), self._seed()).unrelated()
-        return pixel, numbers, columns, rows
-
-    def _looked(self, quick: bool = False) -> tuple[Seen, int, NDArray[np.int64], NDArray[np.int64]]:
-        """What the pilot's rays see of the cloud, how many they are, and the columns and rows that they are from."""
-        if self._pilot_saw is None:
+    def _looked(self, quick: bool = False) -> pilot.Pilot:
+        """What the camera sees of the cloud."""
+        if self._pilot is None:
             clock = time.perf_counter()
-            pixel, numbers, columns, rows = self._pilot(self._window, *((_PILOT // 4, 0) if quick else (_PILOT, _PILOT_FEW)))
-            origin, direction, end = self._camera_rays(pixel, numbers)
-            seen = seen_by(self.cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _PILOT_DEPTHS)
-            self._pilot_saw = seen, dr.width(pixel), columns, rows
-            self._met = len(seen.points) / (_PILOT_DEPTHS * dr.width(pixel))
+            self._pilot = pilot.look(self.types, self.cloud.field, self._window, self._camera_rays, self._seed(), quick)
             self.spent("pilot", clock)
-        return self._pilot_saw
-
-    @property
-    def _thin(self) -> bool:
-        """Whether the cloud hides little of what is behind it where the camera sees it."""
-        seen, rays, *_ = self._looked()
-        return 0 < float(seen.weights.sum()) < _THIN * self._met * rays
+        return self._pilot
 
     def prepare(self, tolerance: float, quick: bool = False, corrected: bool = False, until: float = math.inf) -> None:
         """Predict multiple scattering for this camera; from then on camera rays ask no network.
@@ -322,9 +295,10 @@ class Frame:
         until
             about when to be done, in seconds of `time.perf_counter`: there are no more nodes than that leaves time for.
         """
-        seen, rays, columns, rows = self._looked(quick)
-        if not quick and isinstance(self.cloud.scattering, NetworkScattering) and self._thin:
-            share = self._share(seen, rays)
+        looked = self._looked(quick)
+        seen = looked.seen
+        if not quick and isinstance(self.cloud.scattering, NetworkScattering) and looked.thin:
+            share = self._share(looked)
             if share < _NEGLIGIBLE * tolerance:
                 _LOG.info("multiple scattering is %.2g %% of the image's light: single scattering alone is rendered", 100 * share)
                 self.sources, self.named = [], {}
@@ -364,19 +338,19 @@ class Frame:
         found["light from all around"] = around_it
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
-        self.errors = relative_errors(self.sources, seen, columns, rows, self.scene.size)
+        self.errors = relative_errors(self.sources, seen, looked.columns, looked.rows, self.scene.size)
         self.counts.queries += sum(source.queries for source in self.sources)
         self.spent("prediction", clock)
 
-    def _share(self, seen: Seen, rays: int) -> float:
-        """Share of multiple scattering in the light of the image, by walks from what so many `rays` have `seen`, and a few samples."""
+    def _share(self, looked: pilot.Pilot) -> float:
+        """Share of multiple scattering in the light of the image, by walks from what the camera sees, and a few samples."""
         clock = time.perf_counter()
         random = np.random.default_rng([self.seed & 0xFFFFFFFF, 0x54A2])
-        total = np.cumsum(seen.weights)
+        total = np.cumsum(looked.seen.weights)
         drawn = np.minimum(np.searchsorted(total, (np.arange(_TRIED) + random.random()) / _TRIED * total[-1]), len(total) - 1)
-        points = seen.points[drawn]
+        points = looked.seen.points[drawn]
         j = LightWalks(self.cloud, self.on_cloud)(points, self.camera.toward(points), random)
-        multiple = float(j.mean()) * total[-1] / rays * self._window.share
+        multiple = float(j.mean()) * total[-1] / looked.rays * self._window.share
         width, height = self.scene.size
         pixels = np.unique(np.linspace(0, width * height - 1, _TRIED).astype(np.uint32))
         trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False, sources=[], depths=1)
@@ -395,11 +369,11 @@ class Frame:
             return
         width, height = self.scene.size
         error /= self._weight
-        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, self._window, self._met, self.seed)
+        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, self._window, self._looked().met, self.seed)
         most, at_once, of_thrown = _MOST_TIMED, _TIMED_ROUND, _WALKS_THROWN // 4
         if math.isinf(until):
             # Walks are as noisy as any path: half of the error takes four times as many.
-            usual = min(WALKS_A_PIXEL * width * height, WALKS_A_SIGHT * self._met * self._window.count)
+            usual = min(WALKS_A_PIXEL * width * height, WALKS_A_SIGHT * self._looked().met * self._window.count)
             most = int(np.clip(usual * (ERROR / error) ** 2, FEWEST, MOST))
             at_once, of_thrown = ROUND, _WALKS_THROWN
 
@@ -408,7 +382,7 @@ class Frame:
 
         thrown = None
         if correct and self.all_round is not None and more(_LEAST_THROWN):
-            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, self._window, self._met, self.seed)
+            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, self._window, self._looked().met, self.seed)
             thrown = self.all_round.correct(walks, of_thrown, self.seed)
         outcome = audited(found, self.sources, correct, error, most, more, at_once)
         self.sources, self.found = outcome.sources, outcome.found
@@ -426,8 +400,7 @@ class Frame:
         smoothed = self.film.thrown is not None
         trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False)
         # Samples that meet nothing cost next to nothing.
-        width, height = self.scene.size
-        window = self._window if self.scene.surfaces is None else Window(0, 0, width, height, (width, height))
+        window = self._window if self.scene.surfaces is None else Window.whole(self.scene.size)
         y, x = np.divmod(np.arange(window.count), window.width)
         apart = 4 if window.count > _MANY_PIXELS else 2
         pixels = window.pixels(np.flatnonzero((x // 8 % apart == 0) & (y // 8 % apart == 0))).astype(np.uint32)

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from deepclouds_runtime import frame, surfaces
+from deepclouds_runtime import pilot, surfaces
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.result import RenderResult
 
@@ -52,7 +52,7 @@ def _nodes(image: RenderResult) -> int:
 def test_errors_may_be_larger_where_little_is_scattered_twice(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = load(ball, unbiased=True).render(512, 3)
     found = load(ball, predictor=Smooth()).render(64, correct=True)
-    monkeypatch.setattr(frame, "_THIN", 0.0)
+    monkeypatch.setattr(pilot, "_THIN", 0.0)
     careful = load(ball, predictor=Smooth()).render(64, correct=True)
     assert _nodes(found) < 0.5 * _nodes(careful)
     assert found.rgb.sum() == pytest.approx(paths.rgb.sum(), rel=0.005)
