@@ -56,7 +56,7 @@ ERROR = 0.02
 # an interruption waits for them.
 _PASS, _SLOW_PASS = 1 << 19, 1 << 16
 # Rays that look for what of the surfaces is seen.
-_SURFACE_RAYS = pilot.MOST // 8
+_SURFACE_RAYS = 1 << 13
 # Most queries for the suns, and as many for the light from all around.
 _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
@@ -147,7 +147,8 @@ class Frame:
 
     def __post_init__(self) -> None:
         self.film, self._adaptive = Film(self.scene.size), Adaptive(self.scene.size)
-        # Where the image shows the cloud, and what is seen of it there.
+        # Where the image shows the cloud, and what is seen of it there. Found out at once: later, what else waits to be computed would make
+        # kernels with it, others in every view.
         to_world = self.cloud.field.volume.to_world
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=3))) @ to_world[:3, :3].T + to_world[:3, 3]
         self._window = self.camera.window(corners)

@@ -19,7 +19,7 @@ from deepclouds_runtime.frame_source import Seen, seen_by
 from deepclouds_runtime.stratified import Stratified
 
 # Rays: at most, for a quick look, and where a pixel may have several; and collisions on each of them.
-MOST, _QUICK, _FEW, _DEPTHS = 1 << 16, 1 << 14, 1 << 14, 4
+_MOST, _QUICK, _FEW, _DEPTHS = 1 << 16, 1 << 14, 1 << 14, 4
 # A cloud is thin that hides less than this of what is behind it.
 _THIN = 0.5
 
@@ -72,7 +72,7 @@ def look(
     quick
         by fewer rays.
     """
-    pixel, numbers, columns, rows = spread_pixels(types, window, *((_QUICK, 0) if quick else (MOST, _FEW)), seed)
+    pixel, numbers, columns, rows = spread_pixels(types, window, *((_QUICK, 0) if quick else (_MOST, _FEW)), seed)
     origin, direction, end = rays(pixel, numbers)
     seen = seen_by(field, origin, direction, end, numbers.number(stratified.SHARE), _DEPTHS)
     return Pilot(seen, dr.width(pixel), columns, rows)
