@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of
 from deepclouds.errors import InputError
 from deepclouds.volume.bricks import BRICK_VOXELS, EDGE, Bricks
 
@@ -43,7 +44,7 @@ class DenseGrid:
         _, ny, nx = values.shape
         self.types = types
         self.nbytes = values.nbytes
-        self.data = types.Float(np.ascontiguousarray(values).ravel())
+        self.data = lanes_of(types.Float, values.ravel())
         # Opaque, so that kernels compiled for one grid serve all others.
         self._row, self._plane = dr.opaque(types.UInt32, nx), dr.opaque(types.UInt32, nx * ny)
         self.corners = (types.UInt32(0), self._row, self._plane, self._plane + self._row)
@@ -86,7 +87,7 @@ class BrickGrid:
             )
         table = np.zeros(bricks.grid, np.uint32)
         table[tuple(places.T)] = np.arange(1, count, dtype=np.uint32) * _WIDE_VOXELS
-        self._table = types.UInt32(table.ravel())
+        self._table = lanes_of(types.UInt32, table.ravel())
         _, by, bx = bricks.grid
         self._row, self._plane = dr.opaque(types.UInt32, bx), dr.opaque(types.UInt32, bx * by)
         self.data = _widened(types, bricks, places, scale)
@@ -134,14 +135,14 @@ def _widened(types: ModuleType, bricks: Bricks, places: NDArray[np.int64], scale
     # The brick of zeros stands at a corner that has no neighbours.
     first = np.array([[n - 1 for n in numbers.shape]], np.int64)
     corner = np.concatenate([first, places]) @ (row * column, column, 1)
-    source, number_of = types.Float(bricks.values.ravel()), types.Int32(numbers.ravel())
+    source, number_of = lanes_of(types.Float, bricks.values.ravel()), lanes_of(types.Int32, numbers.ravel())
     last = dr.opaque(types.UInt32, numbers.size - 1)
     lane = dr.arange(types.UInt32, len(corner) * _WIDE_VOXELS)
     brick = lane // _WIDE_VOXELS
     z, rest = _split(lane - brick * _WIDE_VOXELS, _WIDE**2)
     y, x = _split(rest, _WIDE)
     (bz, z), (by, y), (bx, x) = (_split(v, EDGE) for v in (z, y, x))
-    place = dr.gather(types.UInt32, types.UInt32(corner.astype(np.uint32)), brick) + bz * (row * column) + by * column + bx
+    place = dr.gather(types.UInt32, lanes_of(types.UInt32, corner), brick) + bz * (row * column) + by * column + bx
     number = dr.gather(types.Int32, number_of, dr.minimum(place, last))
     value = dr.gather(types.Float, source, types.UInt32(number) * BRICK_VOXELS + z * EDGE**2 + y * EDGE + x, number >= 0)
     # In double precision, which a dense grid's samples are scaled in too.

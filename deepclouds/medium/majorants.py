@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of
 from deepclouds.volume.bricks import EDGE, Bricks
 
 # Edge of a brick, in voxels of the smallest edge.
@@ -84,8 +85,8 @@ class Majorants:
         self.any_empty = bool(np.any(self.empty_radius >= 0))
         count = self.bound.shape[::-1]
         self._types = types
-        self._table = types.Float(np.stack([self.block_bound, self.radius], axis=-1, dtype=np.float32, casting="same_kind").ravel())
-        self._empty = types.Float(self.empty_radius.astype(np.float32).ravel())
+        self._table = lanes_of(types.Float, np.stack([self.block_bound, self.radius], axis=-1).ravel())
+        self._empty = lanes_of(types.Float, self.empty_radius.ravel())
         kept = (self.bound, self.radius, self.block_bound, self.empty_radius)
         self.nbytes = sum(a.nbytes for a in kept) + 4 * 3 * self.bound.size
         self._per_unit = [dr.opaque(types.Float, float(n / b)) for n, b in zip(shape, self.bricks, strict=True)]

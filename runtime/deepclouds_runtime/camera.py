@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepclouds.backend import lanes_of
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.stratified import Stratified
@@ -162,7 +163,7 @@ class Camera:
         mi = mitsuba()
         film = np.tile([[0.0, 0.0], [1, 0], [0, 1]], (len(lens), 1)).astype(np.float32)
         aperture = np.repeat(lens, 3, axis=0).astype(np.float32)
-        place, through = (mi.Point2f(*(mi.Float(np.ascontiguousarray(values[:, c])) for c in range(2))) for values in (film, aperture))
+        place, through = (mi.Point2f(*(lanes_of(mi.Float, values[:, c]) for c in range(2))) for values in (film, aperture))
         ray, _ = self._sensor.sample_ray(mi.Float(self._sensor.shutter_open()), mi.Float(0.5), place, through)
         # Parallel rays share one direction.
         o, d = (np.broadcast_to(np.array(v, np.float64).reshape(3, -1).T, (len(film), 3)) for v in (ray.o, ray.d))

@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import vectors_of
+from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime import pilot
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
@@ -475,7 +475,7 @@ class Frame:
         count = dr.opaque(types.UInt32, samples)
         index = dr.arange(types.UInt32, n)
         local = index // count
-        pixel = dr.gather(types.UInt32, types.UInt32(pixels), local)
+        pixel = dr.gather(types.UInt32, lanes_of(types.UInt32, pixels), local)
         numbers = Stratified(
             types, pixel, index - local * count + dr.opaque(types.UInt32, sample), dr.opaque(types.UInt32, most), self._seed()
         )

@@ -22,13 +22,27 @@ from deepclouds.backend import backend, lanes_of, rows
 from tests.system.smooth_network import Smooth
 
 CLOUD = Path(deepclouds_runtime.__file__).parent / "data" / "demo.vdb"
-# Renders of each kind: memory, which kernels differ by, lies in other places in each.
+# Renders of each kind.
 TRIES = 3
 
 
 @pytest.fixture(autouse=True)
 def mi(llvm_mitsuba: ModuleType) -> ModuleType:
     return llvm_mitsuba
+
+
+@pytest.fixture
+def scattered() -> Callable[[], None]:
+    """Memory that is handed out begins in other places after each call: kernels differ by whether it begins at a multiple of 64 bytes."""
+    rng = np.random.default_rng(0)
+    kept: list[np.ndarray] = []
+
+    def scatter() -> None:
+        kept.extend(np.empty(n, np.float32) for n in rng.choice([3, 5, 17, 33, 100, 1000, 3001], 3000))
+        for place in rng.integers(1500, size=1500):
+            kept.pop(place)
+
+    return scatter
 
 
 def kernels(render: Callable[[], object]) -> set[str]:
@@ -62,7 +76,7 @@ def test_constants_are_found_out() -> None:
 
 
 @pytest.mark.parametrize("sky", [0.0, 0.3], ids=["sun", "sun and sky"])
-def test_another_view_and_other_counts_compile_nothing(sky: float) -> None:
+def test_another_view_and_other_counts_compile_nothing(sky: float, scattered: Callable[[], None]) -> None:
     first, *others = (load(CLOUD, predictor=Smooth(), size=(24, 18), sky=sky, view=(40.0 * i, 5.0 + 5 * i)) for i in range(TRIES + 1))
     # An error that is easily reached takes few walks.
     known = kernels(lambda: first.render(8, seed=1, error=0.25, correct=True))
@@ -72,6 +86,7 @@ def test_another_view_and_other_counts_compile_nothing(sky: float) -> None:
 
     def new(render: Callable[[], object], found: list[int]) -> None:
         nonlocal known
+        scattered()
         ran = kernels(render)
         found.append(len(ran - known))
         known |= ran
