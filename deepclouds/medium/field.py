@@ -73,6 +73,7 @@ class Field:
             self.majorant, last = float(sigma.max()), size - 2
         inverse = np.linalg.inv(volume.to_world)
         self._to_unit = [[dr.opaque(types.Float, float(v)) for v in row] for row in inverse[:3]]
+        self._to_world = [[dr.opaque(types.Float, float(v)) for v in row] for row in volume.to_world[:3]]
         self.samples = [dr.opaque(types.Float, float(n)) for n in volume.resolution]
         self.last = [dr.opaque(types.Float, float(n)) for n in last]
 
@@ -84,8 +85,11 @@ class Field:
 
     def to_unit(self, p: Any) -> Any:
         """World points to coordinates in the unit cube of the grid's box."""
-        m = self._to_unit
-        return type(p)(*(dr.fma(p.x, r[0], dr.fma(p.y, r[1], dr.fma(p.z, r[2], r[3]))) for r in m))
+        return _affine(self._to_unit, p)
+
+    def to_world(self, p: Any) -> Any:
+        """Coordinates in the unit cube of the grid's box to world points."""
+        return _affine(self._to_world, p)
 
     def direction_to_unit(self, d: Any) -> Any:
         """World directions to the unit cube's frame (not normalised)."""
@@ -149,3 +153,7 @@ class Field:
             far = dr.select(parallel, dr.select(outside, -1.0, _FAR), dr.maximum(t0, t1))
             enter, leave = dr.maximum(enter, near), dr.minimum(leave, far)
         return enter, leave
+
+
+def _affine(m: list[list[Any]], p: Any) -> Any:
+    return type(p)(*(dr.fma(p.x, r[0], dr.fma(p.y, r[1], dr.fma(p.z, r[2], r[3]))) for r in m))

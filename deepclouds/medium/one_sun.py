@@ -14,6 +14,7 @@ Light from all around needs no connection: what a walk sees where it leaves the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -25,6 +26,8 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.multiple_scattering import _TURN, _Job, _phase, _Queries, _sample_cosine, _stream, _thinned, _three_uniform, _uniform
 from deepclouds.medium.phase import as_lobes, rotate_to
 
+# World points and unit vectors (Array3f) and which lanes ask -> Float, infinite where nothing is met.
+Ends = Callable[[Any, Any, Any], Any]
 # What a lane is tracing: the walk, the shadow of a vertex, a side branch, the shadow of the branch's end.
 _WALK, _SHADOW, _BRANCH, _BRANCH_SHADOW = range(4)
 
@@ -107,6 +110,7 @@ def trace_to_escape(
     varying: AlbedoField | None = None,
     watched: bool = True,
     shaded: bool = False,
+    ends: Ends | None = None,
 ) -> tuple[NDArray[np.float32], Escapes]:
     """Walks, one a point, under one sun or none, and where they leave the cloud: there each sees light from all around.
 
@@ -123,6 +127,8 @@ def trace_to_escape(
         whether anybody asks for the escapes; those that nobody asks for all have weight 0.
     shaded
         whether anybody asks for `Escapes.sunlit`.
+    ends
+        distance at which opaque surfaces inside of the box end rays: there walks leave the cloud, and no sun is seen past them.
 
     Returns
     -------
@@ -140,7 +146,7 @@ def trace_to_escape(
     job = _Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
     escapes = Escapes(types, n, m_albedos)
     dr.make_opaque(escapes.position, escapes.direction, escapes.weight, escapes.sunlit)
-    kind = _Kind(varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None)
+    kind = _Kind(varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None, ends)
     _loop(field, _Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
     return np.array(job.result).reshape(n, m_albedos), escapes
 
@@ -154,15 +160,16 @@ class _Kind:
         sunlit: bool = True,
         escapes: Escapes | None = None,
         drawn: Any = None,
+        ends: Ends | None = None,
     ) -> None:
-        self.varying, self.sunlit, self.escapes, self.drawn = varying, sunlit, escapes, drawn
+        self.varying, self.sunlit, self.escapes, self.drawn, self.ends = varying, sunlit, escapes, drawn, ends
 
 
 @dr.syntax
 def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     types = field.types
     result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
-    varying, escapes, drawn = kind.varying, kind.escapes, kind.drawn
+    varying, escapes, drawn, ends = kind.varying, kind.escapes, kind.drawn, kind.ends
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
     m_albedos = len(queries.albedos)
     walks_each = dr.opaque(UInt32, job.walks)
@@ -193,6 +200,8 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     # One of the connected vertices, where it is asked for: its place, and its share of what it found by albedo.
     vertex = [dr.zeros(Float, lanes) for _ in range(3 if drawn is not None else 0)]
     parts = [dr.zeros(Float, lanes) for _ in range(m_albedos if drawn is not None else 0)]
+
+    reach = dr.full(Float, np.inf, lanes)  # at which a surface ends the current segment
 
     scattered = dr.full(Bool, False, lanes)  # has collided since its first point
     left = dr.full(Bool, False, lanes)  # has left the cloud after that
@@ -255,9 +264,17 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         rng, u_step = _uniform(types, rng)
         rng, u_event = _uniform(types, rng)
         along = field.direction_to_unit(heading)
+        if ends is not None:
+            fresh = traced & (distance == 0)
+            if fresh:
+                reach = ends(field.to_world(start), heading, fresh)
         distance, tentative, majorant = field.majorants.step(start, along, distance, u_step, traced)
         unit = dr.fma(along, distance, start)
         inside = traced & field.holds_unit(unit)
+        blocked = Bool(False)
+        if ends is not None:
+            blocked = distance >= reach
+            inside &= ~blocked
         rng, thirds = _three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
         hit = inside & tentative & (u_event * majorant < sigma)
@@ -278,7 +295,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         if kind.sunlit:
             toward_sun = _phase(lobes, dr.dot(direction, sun))
             of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
-            lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
+            lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW)) & ~blocked
             arriving = [value * weight[m] for m in range(m_albedos)]
             for m in range(m_albedos):
                 if varying is not None:

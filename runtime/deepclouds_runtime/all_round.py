@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.backend import vectors_of
-from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.correction import FLOOR
 from deepclouds_runtime.frame_source import Arriving, Seen, frame_source, part_of_time
 from deepclouds_runtime.light_walks import LightWalks
-from deepclouds_runtime.lights import on_host
+from deepclouds_runtime.lights import Shade, on_host
 from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.transport import Cloud
 from deepclouds_runtime.walked_source import walked_source
@@ -58,7 +57,7 @@ class AllRound:
         points of the cloud that surfaces see, and the directions (n, 3) in which they see them.
     counts
         (n,) how much the light from there counts in the image.
-    root, tolerance, budget, until
+    root, tolerance, budget, until, shade
         see `frame_source`.
     walks
         estimate J of more light, at nodes of their own; None for no more.
@@ -92,14 +91,16 @@ class AllRound:
         walks: LightWalks | None = None,
         seed: int = 0,
         until: float = math.inf,
+        shade: Shade | None = None,
     ) -> None:
         eyes = [Direction(w) for w in spread(DIRECTIONS)]
         walked = walks is not None and isinstance(cloud.scattering, NetworkScattering)
         first = part_of_time(until, 0.5) if walked else until
-        found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, first)]
+        found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, first, shade=shade)]
         if walks is not None and isinstance(cloud.scattering, NetworkScattering):
             most = min(_WALKS_A_QUERY * budget, walks.most)
-            found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, most, seed, fit, _HARMONICS, until))
+            how = most, seed, fit, _HARMONICS, until
+            found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, *how, shade=shade))
         self.sources = [source for source in found if source is not None]
         self._channels, self._types = len(cloud.albedo), cloud.field.types
         self.queries = sum(source.queries for source in self.sources)
@@ -127,7 +128,7 @@ class AllRound:
             total = [a + b for a, b in zip(total, source.colours(sums), strict=True)]
         return total
 
-    def correct(self, walks: Walks, count: int, seed: int) -> dict[str, Any]:
+    def correct(self, walks: LightWalks, count: int, seed: int) -> dict[str, Any]:
         """Set `factor` by `count` walks from points that surfaces see; returns it and its standard deviation, for a report.
 
         The factor is the ratio of the means of what walks find and of what is predicted, drawn toward 1 as far as chance explains it.
@@ -143,7 +144,7 @@ class AllRound:
         random = np.random.default_rng([seed & 0xFFFFFFFF, 0x7420])
         place = (np.arange(count) + random.random()) / count * total[-1]
         drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
-        found = walks.walked(points[drawn], along[drawn], random)
+        found = walks(points[drawn], along[drawn], random)
         each = (weights[drawn] * (total[-1] / wanted[drawn]))[:, None]
         below = np.maximum((each * predicted[drawn]).mean(axis=0), 1e-30)
         residual = each * (found - predicted[drawn]) / below

@@ -20,7 +20,6 @@ from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
 from deepclouds_runtime.all_round import AllRound, spread
 from deepclouds_runtime.audit import FEWEST, MOST, ROUND, WALKS_A_PIXEL, WALKS_A_SIGHT, Audit, audited
-from deepclouds_runtime.audit_walks import Walks
 from deepclouds_runtime.camera import Camera, Window
 from deepclouds_runtime.confidence import confidence, relative_errors
 from deepclouds_runtime.disc import background, looks_into
@@ -57,6 +56,8 @@ ERROR = 0.02
 _PASS, _SLOW_PASS = 1 << 19, 1 << 16
 # Rays that look for what of the surfaces is seen.
 _SURFACE_RAYS = 1 << 13
+# They end so little before it.
+_BEFORE = 0.9999
 # Most queries for the suns, and as many for the light from all around.
 _BUDGET = 60_000
 # Directions that stand for light from all around, and the share of it from which one of them is treated as a sun.
@@ -181,6 +182,18 @@ class Frame:
             return replace(self.cloud, scattering=None, paths=self._paths, exact=1)
         return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
 
+    def probed(self, corrected: bool) -> Cloud:
+        """The cloud as those surfaces see it whose light goes on into the cloud.
+
+        Where they lie inside of it that is much light, and from a part of the cloud each: in images that walks correct it is path-traced.
+        """
+        if not (corrected and self.on_surfaces.shade.inside and self.cloud.paths is None):
+            return self.thrower
+        return replace(self.cloud, scattering=None, paths=self._traced(), exact=1)
+
+    def _traced(self) -> Paths:
+        return Paths(self.cloud.field, self.cloud.albedo, self.cloud.phase, self.cloud.varying, self.seed)
+
     def _walked(
         self, sources: Sequence[tuple[LightSource, int]], corrected: bool, seen: Seen, along: NDArray[np.float64]
     ) -> LightWalks | None:
@@ -211,7 +224,7 @@ class Frame:
         lower, upper = self.cloud.field.volume.bounds
         if corrected and self._looked().thin:
             # Of it next to all was scattered once or twice and goes on about as the sun's light does, which few directions tell nothing of.
-            self._paths = Paths(self.cloud.field, self.cloud.albedo, self.cloud.phase, self.cloud.varying, self.seed)
+            self._paths = self._traced()
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
             return
         clock = time.perf_counter()
@@ -226,7 +239,8 @@ class Frame:
         for start, ahead in ((origin, direction), (dr.zeros(types.Array3f, len(around)) + middle, out)):
             _, distance, shown = self._surfaces(start, ahead, dr.full(types.Float, math.inf, dr.width(ahead)))
             found: Any = dr.compress(shown)
-            place = dr.fma(ahead, distance, start)
+            # Before the surface, or it would hide what it sees.
+            place = dr.fma(ahead, distance * _BEFORE, start)
             parts.append([np.array(dr.gather(types.Float, v, found)) for v in place])
         places = np.concatenate([np.stack(part, axis=1) for part in parts])
         if len(places):
@@ -238,6 +252,8 @@ class Frame:
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
             o, d = (vectors_of(types, v) for v in (places, ahead))
             end = dr.full(types.Float, math.inf, len(places))
+            if self.on_surfaces.shade.inside:
+                end = self.on_surfaces.shade.reach(o, d)
             seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
             # Light on what the camera sees counts in the image, by the cloud's size as seen from there.
             counts = np.square(radius / np.maximum(np.linalg.norm(places - 0.5 * (lower + upper), axis=1), radius))
@@ -249,7 +265,7 @@ class Frame:
             else:
                 for source, _ in self.on_surfaces.sources:
                     lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            how = _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed, until
+            how = _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed, until, self.on_surfaces.shade
             self.all_round = AllRound(self._roughly, lights, seen, ahead[seen.rays], counts[seen.rays], *how)
             self.counts.queries += self.all_round.queries
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
@@ -269,7 +285,7 @@ class Frame:
             lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.
         wide = 2 * _THROWN * tolerance
-        how = _ROOT_AROUND, wide, _BUDGET // 4, walks, self.seed + 1, until
+        how = _ROOT_AROUND, wide, _BUDGET // 4, walks, self.seed + 1, until, self.on_surfaces.shade
         first.again = AllRound(self._roughly, lights, first.seen, first.along, first.counts, *how)
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
@@ -327,15 +343,17 @@ class Frame:
         of_suns *= _CORRECTED if corrected else 1.0
         eyes, first = [self.camera], part_of_time(until, 0.5) if around or walks is not None else until
         finest = _FINEST * float(np.quantile(self.camera.footprint(seen.points), _NEAR)) if len(seen.points) else 0.0
+        shade = self.on_cloud.shade
         found = {
-            "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first, finest=finest),
+            "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first, finest=finest, shade=shade),
         }
         if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
             how = seen, _ROOT_AROUND, of_around, walks.most, self.seed
-            around_it = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until, finest=finest)
+            around_it = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until, finest=finest, shade=shade)
         else:
             root = wide * _ROOT_AROUND
-            around_it = frame_source(self._roughly, around, eyes, seen, root, of_around, _BUDGET, until=until, finest=finest)
+            how_far = root, of_around, _BUDGET
+            around_it = frame_source(self._roughly, around, eyes, seen, *how_far, until=until, finest=finest, shade=shade)
         found["light from all around"] = around_it
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
@@ -383,8 +401,7 @@ class Frame:
 
         thrown = None
         if correct and self.all_round is not None and more(_LEAST_THROWN):
-            walks = Walks(self.cloud, self.on_cloud, (), self._camera_rays, self._window, self._looked().met, self.seed)
-            thrown = self.all_round.correct(walks, of_thrown, self.seed)
+            thrown = self.all_round.correct(LightWalks(self.cloud, self.on_cloud), of_thrown, self.seed)
         outcome = audited(found, self.sources, correct, error, most, more, at_once)
         self.sources, self.found = outcome.sources, outcome.found
         if thrown is not None and self.found:

@@ -39,6 +39,8 @@ _DEEP = 1e6
 _AROUND, _REACH = 32, 2.0
 # Of a budget of queries, what the corners of the coarsest cells may take.
 _OVERDRAWN = 4
+# Nodes behind a surface stand this share of the way to it.
+_BEFORE = 0.99
 # Corners that the coarsest cells have at least, however short the time, and points that there is always time for.
 _LEAST_CORNERS, _UNLIMITED = 64, 1 << 62
 
@@ -248,6 +250,7 @@ def frame_source(
     every: int = 1,
     until: float = math.inf,
     finest: float = 0.0,
+    shade: Shade | None = None,
 ) -> FrameSource | None:
     """J of a frame; None where it is 0 everywhere.
 
@@ -274,6 +277,8 @@ def frame_source(
         about when to be done, in seconds of `time.perf_counter`: there are no more nodes than should be ready by then.
     finest
         edge, world, below which cells are not split: what an eye can tell apart.
+    shade
+        of surfaces; where they may lie inside of the cloud, nodes behind them take J from before them.
     """
     network = cloud.scattering
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
@@ -282,7 +287,8 @@ def frame_source(
     predicted = _Predicted(cloud, network, lights, albedos, eyes, combine)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     checks = max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes)))
-    return interpolated(cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until, finest=finest)
+    how = cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until
+    return interpolated(*how, finest=finest, shade=shade)
 
 
 class Evaluates(Protocol):
@@ -320,12 +326,13 @@ def interpolated(
     until: float = math.inf,
     overdrawn: int = _OVERDRAWN,
     finest: float = 0.0,
+    shade: Shade | None = None,
 ) -> FrameSource:
     """What `evaluate` says at the nodes of an octree, interpolated.
 
     Parameters
     ----------
-    field, seen, root, tolerance, every, until, finest
+    field, seen, root, tolerance, every, until, finest, shade
         as for `frame_source`.
     network
         has the unit of length, and what nodes are aligned to.
@@ -355,7 +362,9 @@ def interpolated(
         if corners <= most or lattice.size.max() <= 2:
             break
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
-    octree = Octree(lattice, paced, built_for.points, built_for.weights, tolerance, nodes, levels, evaluate.carried, paced.affordable)
+    place = _BeforeSurfaces(field.types, shade) if shade is not None and shade.inside else None
+    how = tolerance, nodes, levels, evaluate.carried, paced.affordable, place
+    octree = Octree(lattice, paced, built_for.points, built_for.weights, *how)
     device = octree.upload(field.types)
     factor, error, means = _audit(device, true, held_out, every)
     level = float(means @ evaluate.mix.mean(axis=0)) if len(means) == evaluate.mix.shape[1] else 1.0
@@ -369,6 +378,27 @@ def part_of_time(until: float, share: float) -> float:
     """The end of a share of the time from now until then, in seconds of `time.perf_counter`."""
     now = time.perf_counter()
     return now + share * (until - now)
+
+
+class _BeforeSurfaces:
+    """Moves nodes to where they are seen from.
+
+    A node behind a surface, or inside of it, is interpolated with others before it, but it is in the dark, or in other light.
+    """
+
+    def __init__(self, types: Any, shade: Shade) -> None:
+        self._types, self._shade = types, shade
+
+    def __call__(self, points: Array, near: Array) -> Array:
+        """World points (n, 3); those that a surface hides from what is seen near them (n, 3) are moved toward that, to before it."""
+        if not len(points):
+            return points
+        way = points - near
+        length = np.maximum(np.linalg.norm(way, axis=1), 1e-30)
+        reach = self._shade.reach(vectors_of(self._types, near), vectors_of(self._types, way / length[:, None]))
+        free = np.broadcast_to(np.array(reach, np.float64), len(points)) * _BEFORE
+        moved: Array = near + way * np.minimum(free / length, 1)[:, None]
+        return moved
 
 
 class _Paced:

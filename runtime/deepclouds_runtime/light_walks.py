@@ -99,6 +99,7 @@ class LightWalks:
     def _of_one(self, points: Array, along: Array, light: _Connected | None, share: float, key: int, random: np.random.Generator) -> Array:
         """J (n, channels) of walks that are connected to `light`, a `share` of all."""
         cloud, types, n = self._cloud, self._cloud.field.types, len(points)
+        shade = self._lights.shade
         own = on_host(cloud.albedo_at(vectors_of(types, points)), n)
         if cloud.varying is None:
             albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
@@ -117,9 +118,10 @@ class LightWalks:
             key & 0xFFFFFFFF,
             varying=cloud.varying,
             watched=bool(self._lights.sources),
-            shaded=self._lights.shade.surfaces is not None,
+            shaded=shade.surfaces is not None and not shade.inside,
+            ends=shade.reach if shade.inside else None,
         )
-        if toward is not None and self._lights.shade.surfaces is not None:
+        if toward is not None and shade.surfaces is not None and not shade.inside:
             arriving = arriving * self._unshaded(escapes.sunlit, toward)[:, None]
         seen = self._seen(escapes, n, key)
         result = np.zeros((n, len(column)))

@@ -29,6 +29,8 @@ _PART_SIZE = 0.5
 # Most directions that stand for what is bright of an environment, and how close, in degrees, they are one.
 _MOST_BRIGHT, _TOGETHER = 24, 15.0
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
+# Surfaces reach into a box where they do by more than this share of its diagonal.
+_TOUCH = 1e-5
 
 
 class LightSource(Protocol):
@@ -52,6 +54,10 @@ class LightSource(Protocol):
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance that arrives at `points` from `direction` where there is no cloud; one array a colour channel."""
+        ...
+
+    def reach(self, points: Any, direction: Any) -> Any:
+        """Distance (Float) to where this light comes from, infinite beyond the cloud: so much of the cloud it goes through."""
         ...
 
 
@@ -83,10 +89,18 @@ class Shade:
         Dr.Jit types.
     surfaces
         Mitsuba scene of the surfaces alone, or None.
+    bounds
+        lower and upper corner (3,) of the cloud's box, world.
+
+    Attributes
+    ----------
+    inside
+        whether a surface may lie inside of that box.
     """
 
-    def __init__(self, types: ModuleType, surfaces: Any) -> None:
+    def __init__(self, types: ModuleType, surfaces: Any, bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None) -> None:
         self.types, self.surfaces = types, surfaces
+        self.inside = surfaces is not None and bounds is not None and any(_meets(shape.bbox(), *bounds) for shape in surfaces.shapes())
 
     def visible(self, points: Any, directions: Any) -> Any:
         """Whether no surface stands between the points and what lies in these directions."""
@@ -94,6 +108,20 @@ class Shade:
             return self.types.Bool(True)
         mi = mitsuba()
         return ~plain(self.types, self.surfaces.ray_test(mi.Ray3f(mi.Point3f(points), mi.Vector3f(directions))))
+
+    def reach(self, points: Any, directions: Any, active: Any = True) -> Any:
+        """Distance (Float) from the points to the first surface in these directions, infinite where there is none."""
+        if self.surfaces is None:
+            return self.types.Float(math.inf)
+        mi = mitsuba()
+        hit = self.surfaces.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(points), mi.Vector3f(directions)), active=mi.Mask(active))
+        return dr.select(plain(self.types, hit.is_valid()), plain(self.types, hit.t), math.inf)
+
+
+def _meets(box: Any, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> bool:
+    """Whether a Mitsuba bounding box reaches into the box between two corners; to touch it from outside is not enough."""
+    margin = _TOUCH * float(np.linalg.norm(upper - lower))
+    return bool(np.all(np.array(box.min, np.float64) < upper - margin) and np.all(np.array(box.max, np.float64) > lower + margin))
 
 
 class Environment:
@@ -153,6 +181,10 @@ class Environment:
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
         """Radiance past the surfaces; see `LightSource`."""
         return self.seen(points, direction)
+
+    def reach(self, points: Any, direction: Any) -> Any:
+        """It lies beyond the cloud; see `LightSource`."""
+        return self.types.Float(math.inf)
 
     def seen(self, points: Any, direction: Any) -> list[Any]:
         """The same: it takes no random numbers."""

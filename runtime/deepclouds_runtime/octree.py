@@ -139,6 +139,8 @@ class Octree:
         so many of the fields, the last ones, are known at the nodes that the others ask for: they refine nothing.
     affordable
         is asked before each level how many more points may be asked for, for another reason than the budget.
+    place
+        corners of cells, world points (n, 3), and for each one of `points` (n, 3) that lies near -> where the corner's value is asked for.
 
     Attributes
     ----------
@@ -157,8 +159,10 @@ class Octree:
         levels: int,
         carried: int = 0,
         affordable: Callable[[], int] | None = None,
+        place: Callable[[Array, Array], Array] | None = None,
     ) -> None:
         self.lattice = lattice
+        self._place = place
         self.statistics = Statistics()
         self._evaluate = evaluate
         self._levels = min(levels, _BITS - 1 - int(lattice.size.max()).bit_length())
@@ -168,9 +172,11 @@ class Octree:
         local = np.clip(lattice.local(points), 0, lattice.size - 1e-6)
         cell_of_point = local.astype(np.int64)
         index = cell_of_point[:, 0] + nx * (cell_of_point[:, 1] + ny * cell_of_point[:, 2])
-        cells, member = np.unique(index, return_inverse=True)
+        cells, some, member = np.unique(index, return_index=True, return_inverse=True)
+        # One of the points for each cell, that of its parent where it holds none.
+        near = points[some]
         coordinates = np.stack([cells % nx, cells // nx % ny, cells // (nx * ny)], axis=1)
-        values = self._corner_values(coordinates, 0)
+        values = self._corner_values(coordinates, 0, near)
         # Fields that decide what is refined.
         self.fields = values.shape[2] - carried
         leaves = [self._roots(coordinates, values)]
@@ -202,12 +208,15 @@ class Octree:
             # and the image meets places that no point has tried.
             chosen = split[member]
             local, weights, member = local[chosen], weights[chosen], (np.cumsum(split) - 1)[member[chosen]]
+            points = points[chosen]
             parents, before, blocks = coordinates[split], values[split], int(split.sum())
             child = (local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[member]
             member = 8 * member + child @ (1, 2, 4)
             coordinates = (2 * parents[:, None] + _CORNERS).reshape(-1, 3)
+            near = np.repeat(near[split], 8, axis=0)
+            near[member] = points
             continued = np.einsum("oci,pik->pock", _CHILD_WEIGHTS, before[..., : self.fields]).reshape(8 * blocks, 8, self.fields)
-            values = self._corner_values(coordinates, level + 1)
+            values = self._corner_values(coordinates, level + 1, near)
             known_error = np.sqrt(np.square(values[..., : self.fields] - continued).max(axis=2).mean(axis=1) * (8 / 7)) / _GAIN
             # Every split cell gets a block of eight leaves, and of eight entries of the table that its own now points at.
             table[slots[split]] = -len(table) - 8 * np.arange(blocks)
@@ -232,12 +241,12 @@ class Octree:
         )
         return float(mean.max(initial=0.0))
 
-    def _corner_values(self, coordinates: Array, level: int) -> Array:
-        """Values (m, 8, k) at the corners of cells (m, 3) of a level, asking for those that are not known yet."""
+    def _corner_values(self, coordinates: Array, level: int, near: Array) -> Array:
+        """Values (m, 8, k) at the corners of cells (m, 3) of a level, with a point (m, 3) in or near each; unknown ones are asked for."""
         corners = (coordinates[:, None] + _CORNERS) << (self._levels - level)
         keys = corners[..., 0] | corners[..., 1] << _BITS | corners[..., 2] << 2 * _BITS
         unique: Array
-        unique, inverse = np.unique(keys, return_inverse=True)
+        unique, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
         place = np.searchsorted(self._keys, unique)
         found = np.zeros(len(unique), bool)
         inside = place < len(self._keys)
@@ -245,7 +254,8 @@ class Octree:
         new = unique[~found]
         mask = (1 << _BITS) - 1
         fine = np.stack([new & mask, new >> _BITS & mask, new >> 2 * _BITS], axis=1)
-        values = self._evaluate(self.lattice.world(fine / 2.0**self._levels))
+        world = self.lattice.world(fine / 2.0**self._levels)
+        values = self._evaluate(world if self._place is None else self._place(world, near[first[~found] // 8]))
         if self._known.shape[1] == 0:
             self._known = np.empty((0, values.shape[1]), np.float32)
         self._keys = np.concatenate([self._keys, new])

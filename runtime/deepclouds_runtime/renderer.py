@@ -334,7 +334,8 @@ class Renderer:
                 frame.prepare_thrown(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
             for turn in range(_TURNS if self._interreflection else 0):
                 clock = time.perf_counter()
-                reflectors = Reflectors(frame.thrower, lights, frame.on_cloud, (frame.seed + turn) & 0xFFFFFFFF, frame.counts)
+                seed = (frame.seed + turn) & 0xFFFFFFFF
+                reflectors = Reflectors(frame.probed(correct), lights, frame.on_cloud, seed, frame.counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
                 if turn == 0 or math.isinf(until):
@@ -398,7 +399,7 @@ class Renderer:
 
     def _lights(self) -> Lights:
         """The lights, with the tables that depend on them: made anew for each render."""
-        shade = Shade(self._types, self.scene.surfaces)
+        shade = Shade(self._types, self.scene.surfaces, self.scene.volume.bounds)
         sources = []
         if self.scene.environment is not None:
             sources.append((environment(self._types, self.scene.environment, shade), self.environment_directions))

@@ -354,9 +354,9 @@ def single_scattering(
     # A network is told the whole depth.
     deepest = _DEEP if each is not None else TAU_OPAQUE
 
-    def light(omega: Any, radiance: list[Any], share: Any) -> None:
-        """One direction: `radiance` is what arrives over the density of the direction."""
-        tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), types.Bool(True), deepest)
+    def light(omega: Any, radiance: list[Any], share: Any, end: Any) -> None:
+        """One direction: `radiance` is what arrives over the density of the direction, from the distance `end`."""
+        tau = optical_depth(medium, points, omega, types.Float(0), end, types.Bool(True), deepest)
         single = two_lobe(dr.dot(w, omega), *lobes) * dr.exp(-tau) * share
         for c in range(channel_count):
             direct[c] += albedo[c] * radiance[c] * single
@@ -364,27 +364,28 @@ def single_scattering(
             dr.eval(tau, direct, radiance)
             each(omega, radiance, tau)
 
+    far = types.Float(math.inf)
     for disc in discs(types, lights.suns, lights.shade):
         # A disc is small: directions drawn from it alone do where the phase function's peak is no narrower.
         omega, density = disc.sample(numbers.number(stratified.LIGHT_U), numbers.number(stratified.LIGHT_V))
-        light(omega, [value / density for value in disc.arriving(points, omega, numbers)], 1)
+        light(omega, [value / density for value in disc.arriving(points, omega, numbers)], 1, far)
     for sun in lights.suns:
         if sun.radius > 0:
             continue
         omega = types.Array3f(*(dr.opaque(types.Float, v) for v in sun.omega_sun))
         seen = lights.shade.visible(points, omega)
-        light(omega, [dr.select(seen, dr.opaque(types.Float, e), 0) for e in sun.irradiance], 1)
+        light(omega, [dr.select(seen, dr.opaque(types.Float, e), 0) for e in sun.irradiance], 1, far)
     for source, directions in lights.sources:
         for k in range(directions):
             numbers_of = functools.partial(numbers.number, part=k, parts=directions)
             omega, density = source.sample(numbers_of(stratified.LIGHT_U), numbers_of(stratified.LIGHT_V))
             radiance = [v / (density * directions) for v in source.arriving(points, omega, numbers)]
-            light(omega, radiance, density / (density + two_lobe(dr.dot(w, omega), *lobes)))
+            light(omega, radiance, density / (density + two_lobe(dr.dot(w, omega), *lobes)), source.reach(points, omega))
             # The other half of the pair: a direction from the phase function, for a strong peak that the source's table knows nothing of.
             cosine = sample_two_lobe_cosine(numbers_of(stratified.PHASE_U), *lobes)
             omega = rotate_to(w, cosine, 2 * dr.pi * numbers_of(stratified.PHASE_V))
             drawn = two_lobe(cosine, *lobes)
-            tau = optical_depth(medium, points, omega, types.Float(0), types.Float(math.inf), types.Bool(True))
+            tau = optical_depth(medium, points, omega, types.Float(0), source.reach(points, omega), types.Bool(True))
             share = drawn / (drawn + source.density(omega)) * (1.0 / directions) * dr.exp(-tau)
             for c, value in enumerate(source.arriving(points, omega, numbers)):
                 direct[c] += albedo[c] * value * share

@@ -14,6 +14,7 @@ import numpy as np
 
 from deepclouds_runtime.frame_source import FrameSource, Seen, Sees, interpolated
 from deepclouds_runtime.light_walks import LightWalks
+from deepclouds_runtime.lights import Shade
 from deepclouds_runtime.octree import Array
 from deepclouds_runtime.scattering import NetworkScattering, Stopped
 from deepclouds_runtime.transport import Cloud
@@ -44,12 +45,13 @@ def walked_source(
     every: int = 1,
     until: float = math.inf,
     finest: float = 0.0,
+    shade: Shade | None = None,
 ) -> FrameSource | None:
     """J of a frame under the lights of `walks`; None where the camera sees no cloud, or it is black.
 
     Parameters
     ----------
-    cloud, eyes, seen, root, tolerance, combine, every, until, finest
+    cloud, eyes, seen, root, tolerance, combine, every, until, finest, shade
         see `deepclouds_runtime.frame_source.frame_source`.
     network
         has the unit of length, and knows whether to give up, by `Stopped`; it is not asked.
@@ -66,7 +68,7 @@ def walked_source(
     if len(eyes) == 1:
         found.choose(seen)
     nodes, checks = most // (found.each * len(eyes)), max(_LEAST_CHECKS, _CHECKS // len(eyes))
-    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until, 1, finest)
+    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until, 1, finest, shade)
 
 
 class _Walked:
