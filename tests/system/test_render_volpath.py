@@ -32,9 +32,15 @@ FLOOR = (
     '<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="5"/><translate y="-1.3"/></transform>'
     '<bsdf type="diffuse"><rgb name="reflectance" value="{0}"/></bsdf></shape>'
 )
+# Through the cloud, most of which lies above it.
+CUT = FLOOR.replace("-1.3", "-0.25")
 BALL = (
     '<shape type="sphere"><point name="center" value="0.9, 0.2, 1.2"/><float name="radius" value="0.4"/>'
     '<bsdf type="twosided"><bsdf type="plastic"/></bsdf></shape>'
+)
+BLACK_BALL = (
+    '<shape type="sphere"><point name="center" value="0.1, 0, 0.2"/><float name="radius" value="0.35"/>'
+    '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></shape>'
 )
 # Across the sun's way, so that half of the cloud is in its shade.
 WALL = (
@@ -85,6 +91,11 @@ SCENES = {
     "floor": Scene(SUN, FLOOR.format(0.5), slack=0.005),
     "floor under a map": Scene(MAP, FLOOR.format(0.5), slack=0.005),
     "half in the shade": Scene(SUN, WALL, spp=384),
+    "dark floor through the cloud": Scene(SUN + CONSTANT, CUT.format(0.0)),
+    "floor through the cloud": Scene(SUN, CUT.format(0.5), slack=0.005),
+    "single, floor through the cloud": Scene(SUN, CUT.format(0.5), max_depth=2),
+    "dark ball inside under a map": Scene(MAP, BLACK_BALL, g=0.65, spp=384),
+    "varying albedo and a dark ball inside": Scene(SUN, BLACK_BALL, varying=True),
 }
 
 
