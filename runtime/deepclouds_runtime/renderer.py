@@ -24,11 +24,11 @@ from deepclouds_runtime.frame import ERROR, Frame
 from deepclouds_runtime.frame_source import part_of_time
 from deepclouds_runtime.light_walks import Paths
 from deepclouds_runtime.lights import Shade, environment
+from deepclouds_runtime.reflectors import Reflectors
 from deepclouds_runtime.result import COLOURS, RenderResult, Statistics
 from deepclouds_runtime.rounds import Watch, fixed_rounds, rounds_for_error, say_ignored
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped
 from deepclouds_runtime.scene import CloudScene
-from deepclouds_runtime.surfaces import Reflectors
 from deepclouds_runtime.transport import Cloud, Lights
 
 MODES = ("fast", "reference")

@@ -1,22 +1,19 @@
-"""Light on opaque surfaces: straight from the lights, and from the cloud; and what the surfaces send back to the cloud."""
+"""Light on opaque surfaces: straight from the lights, and from the cloud."""
 
 from __future__ import annotations
 
 import math
-from types import ModuleType
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of, vectors_of
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
 from deepclouds_runtime.disc import Disc, discs
-from deepclouds_runtime.lights import Beam, Environment, LightSource, directions_of_cells, on_host
+from deepclouds_runtime.lights import LightSource
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
@@ -24,11 +21,6 @@ from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 # Of the rays that look for light of the cloud, those toward suns at most; the peak of a phase function that gets half of them; and what
 # is not worth the while.
 _MOST_HALO, _PEAK, _LEAST_HALO = 0.4, 6.0, 0.05
-_PROBE_ROWS = 32
-# Rays into each cell of the table; more where surfaces lie inside of the cloud, which sees them near by.
-_PROBE_PARTS, _PROBE_PARTS_INSIDE = 4, 64
-# A sample beside the middle sees lit surfaces where the middle sees the cloud's own shadow: many directions ignore the table.
-_PROBE_UNIFORM = 0.5
 
 
 def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratified) -> list[Any]:
@@ -207,85 +199,3 @@ def diffuse_share(types: Any, interaction: Any) -> tuple[list[Any], Any]:
     shiny = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
     share = channels(types, bsdf.eval_diffuse_reflectance(interaction, valid))
     return share, plain(types, valid & ~shiny)
-
-
-class Reflectors:
-    """The surfaces around a cloud as a light source: what they reflect reaches the cloud's samples.
-
-    Directions are drawn from a table of what the surfaces look like from the middle of the cloud's box. The radiance of the lights that
-    they reflect is that of the surface seen from the sample; the cloud's own light that they send back is looked up in the table, where
-    the middle sees the same place.
-
-    Parameters
-    ----------
-    cloud, lights
-        what dims the light on its way to the surfaces, and the lights.
-    on_cloud
-        what lights the cloud, whose own light the surfaces send back.
-    seed
-        32 bits, of the table's random numbers.
-    counts
-        is updated.
-    """
-
-    def __init__(self, cloud: Cloud, lights: Lights, on_cloud: Lights, seed: int, counts: Counts) -> None:
-        self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
-        colours, thrown = self._probe(on_cloud, seed, counts)
-        self._table = Environment(self._types, self._nothing, colours, uniform=_PROBE_UNIFORM)
-        self._thrown = [lanes_of(self._types.Float, thrown[:, c]) for c in range(thrown.shape[1])]
-        self._middle = self._probed()
-        self.sample, self.density, self.beams = self._table.sample, self._table.density, self._table.beams
-
-    def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
-        """Radiance of the surface seen from `points`, 0 where there is none; see `LightSource`."""
-        interaction = self._seen(points, direction)
-        shown = plain(self._types, interaction.is_valid())
-        direct = reflected(self._cloud, self._lights, interaction, numbers.unrelated())
-        # What the middle sees where the point's ray ends; it may be something before that.
-        there = plain(self._types, interaction.p) - self._middle
-        there = dr.select(shown, there / dr.maximum(dr.norm(there), 1e-20), direction)
-        return [d + dr.select(shown, self._table.lookup(t, there), 0) for d, t in zip(direct, self._thrown, strict=True)]
-
-    def reach(self, points: Any, direction: Any) -> Any:
-        """Distance to the surface seen from `points`, where that may lie inside of the cloud; see `LightSource`."""
-        shade = self._lights.shade
-        return shade.reach(points, direction) if shade.inside else self._types.Float(math.inf)
-
-    def arriving_beam(self, points: Any, beam: Beam, numbers: Stratified) -> list[Any]:
-        """Irradiance of a beam: the surface that `points` see in its direction stands for all of its part; see `LightSource`."""
-        omega = self._types.Array3f(*(dr.opaque(self._types.Float, v) for v in beam.omega))
-        direction = dr.zeros(self._types.Array3f, dr.width(points)) + omega
-        solid_angle = dr.opaque(self._types.Float, beam.solid_angle)
-        return [value * solid_angle for value in self.arriving(points, direction, numbers)]
-
-    def _seen(self, points: Any, direction: Any) -> Any:
-        mi = mitsuba()
-        return self._lights.shade.surfaces.ray_intersect(mi.Ray3f(mi.Point3f(points), mi.Vector3f(direction)))
-
-    def _nothing(self, direction: Any) -> list[Any]:
-        return [dr.zeros(self._types.Float, dr.width(direction)) for _ in self._cloud.albedo]
-
-    def _probed(self) -> Any:
-        """The box's middle (Array3f)."""
-        lower, upper = self._cloud.field.volume.bounds
-        return self._types.Array3f(*(dr.opaque(self._types.Float, float(v)) for v in 0.5 * (lower + upper)))
-
-    def _probe(self, on_cloud: Lights, seed: int, counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Colour (rows, columns, channels) of the surfaces around the box's middle; the cloud's light they send (cells, channels)."""
-        types: ModuleType = self._types
-        rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
-        middle = self._probed()
-        parts = _PROBE_PARTS_INSIDE if self._lights.shade.inside else _PROBE_PARTS
-        cells, n = rows * columns, rows * columns * parts
-        places = np.random.default_rng(seed).random((parts, 2))
-        local = np.concatenate([directions_of_cells(rows, columns, (float(u), float(v))).reshape(-1, 3) for u, v in places])
-        lane, one = dr.arange(types.UInt32, n), dr.opaque(types.UInt32, cells)
-        part = lane // one
-        numbers = Stratified(types, lane - part * one, part, dr.opaque(types.UInt32, parts), dr.opaque(types.UInt32, seed)).unrelated()
-        interaction = self._seen(dr.zeros(types.Array3f, n) + middle, vectors_of(types, local))
-        dr.eval(interaction)
-        direct = reflected(self._cloud, self._lights, interaction, numbers)
-        sent = on_host(reflected_from_cloud(self._cloud, on_cloud, interaction, dr.full(types.Float, 1, n), numbers, counts), n)
-        thrown = sent.reshape(parts, cells, -1).mean(axis=0)
-        colours = on_host(direct, n).reshape(parts, cells, -1).mean(axis=0) + thrown
-        return colours.reshape(rows, columns, -1), thrown
