@@ -78,8 +78,8 @@ _TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 4096, 0.04, 0.5, 4.0
 _CORRECTED, _THROWN = 1.6, 4.0
 # Rays from a sample of a surface that look for this light, where they are short: it is noisier than all else in a sample.
 _RAYS_THROWN = 2
-# Walks that correct the light thrown on surfaces, by a single number.
-_WALKS_THROWN = 1 << 17
+# Walks that correct the light thrown on surfaces, by a single number, and the largest that is believed.
+_WALKS_THROWN, _MOST_WRONG = 1 << 17, 1.5
 # Collisions of a camera ray that get shadow rays; under suns alone, where these are all that they cost, more: along a ray noise falls with
 # their number, not with its root.
 _DEPTHS, _DEPTHS_SUNS = 4, 8
@@ -402,6 +402,12 @@ class Frame:
         thrown = None
         if correct and self.all_round is not None and more(_LEAST_THROWN):
             thrown = self.all_round.correct(LightWalks(self.cloud, self.on_cloud), of_thrown, self.seed)
+            wrong = max((max(f, 1 / max(f, 1e-9)) for f in thrown.get("factor", ())), default=1.0)
+            if wrong > _MOST_WRONG:
+                # One number does not mend that.
+                self._paths = self._traced()
+                thrown["traced"] = True
+                _LOG.info("light thrown on surfaces is predicted wrongly by a factor of %.3g: it is path-traced instead", wrong)
         outcome = audited(found, self.sources, correct, error, most, more, at_once)
         self.sources, self.found = outcome.sources, outcome.found
         if thrown is not None and self.found:
