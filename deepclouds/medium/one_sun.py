@@ -43,16 +43,19 @@ class Escapes:
         (n,) unit vectors in which they leave it.
     weight
         one Float for each albedo: radiance that comes from there, times the weight and the albedo of the walk's first point, is J; 0 of
-        walks that did not collide again, and of those that were ended.
+        walks that did not collide again, unless they are asked for, and of those that were ended.
     sunlit
         (n,) points in the unit cube of the box: of all vertices that a walk was connected at, one, drawn in proportion to what it found
         there. Whatever else stands between it and the sun multiplies what the whole walk found. Only kept where it is asked for.
+    collided
+        (n,) 1 of walks that collided again after their first point, 0 of others. Only kept where those are asked for.
     """
 
     def __init__(self, types: Any, count: int, albedos: int) -> None:
         self.position, self.direction = dr.zeros(types.Array3f, count), dr.zeros(types.Array3f, count)
         self.weight = [dr.zeros(types.Float, count) for _ in range(albedos)]
         self.sunlit = dr.zeros(types.Array3f, count)
+        self.collided = dr.zeros(types.Float, count)
 
 
 def trace_one_sun(
@@ -111,6 +114,7 @@ def trace_to_escape(
     watched: bool = True,
     shaded: bool = False,
     ends: Ends | None = None,
+    straight: bool = False,
 ) -> tuple[NDArray[np.float32], Escapes]:
     """Walks, one a point, under one sun or none, and where they leave the cloud: there each sees light from all around.
 
@@ -129,6 +133,8 @@ def trace_to_escape(
         whether anybody asks for `Escapes.sunlit`.
     ends
         distance at which opaque surfaces inside of the box end rays: there walks leave the cloud, and no sun is seen past them.
+    straight
+        whether anybody asks for walks too that leave the cloud straight from their first point: what they see is scattered once.
 
     Returns
     -------
@@ -145,8 +151,10 @@ def trace_to_escape(
     toward = np.broadcast_to(np.array([0, 0, 1], np.float32), (n, 3)) if suns is None else suns
     job = _Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
     escapes = Escapes(types, n, m_albedos)
-    dr.make_opaque(escapes.position, escapes.direction, escapes.weight, escapes.sunlit)
-    kind = _Kind(varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None, ends)
+    dr.make_opaque(escapes.position, escapes.direction, escapes.weight, escapes.sunlit, escapes.collided)
+    kind = _Kind(
+        varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None, ends, straight
+    )
     _loop(field, _Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
     return np.array(job.result).reshape(n, m_albedos), escapes
 
@@ -161,8 +169,10 @@ class _Kind:
         escapes: Escapes | None = None,
         drawn: Any = None,
         ends: Ends | None = None,
+        straight: bool = False,
     ) -> None:
         self.varying, self.sunlit, self.escapes, self.drawn, self.ends = varying, sunlit, escapes, drawn, ends
+        self.straight = straight
 
 
 @dr.syntax
@@ -227,6 +237,8 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                     dr.scatter(escapes.direction[c], direction[c], number, left)
                 for m in range(m_albedos):
                     dr.scatter(escapes.weight[m], weight[m], number, left)
+                if kind.straight:
+                    dr.scatter(escapes.collided, dr.select(scattered, Float(1), 0), number, left)
             scattered, left = Bool(False), Bool(False)
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
@@ -336,7 +348,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         direction = dr.select(turn, rotate_to(direction, cosine, 2 * np.pi * u_azimuth), direction)
         density = dr.select(turn, _phase(lobes, cosine), density)
         rival = dr.select(turn, 1, rival)
-        left |= gone & walking & scattered
+        left |= gone & walking if kind.straight else gone & walking & scattered
         ended |= gone & walking
         if job.roulette:
             rng, lost, weight = _thinned(types, rng, weight, turn & ~begun)

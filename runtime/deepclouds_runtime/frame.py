@@ -156,6 +156,8 @@ class Frame:
         self._pilot: pilot.Pilot | None = None
         # What finds J of the light that a thin cloud throws on surfaces.
         self._paths: Paths | None = None
+        # Sources whose single scattering is interpolated.
+        self._smooth: tuple[LightSource, ...] = ()
         # What an error of multiple scattering is in the image, of a thin cloud; 1 of others.
         self._weight = 1.0
 
@@ -182,6 +184,11 @@ class Frame:
             return replace(self.cloud, scattering=None, paths=self._paths, exact=1)
         return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
 
+    @property
+    def _of_image(self) -> Lights:
+        """The lights, with what of them is interpolated in this camera's image."""
+        return replace(self.on_cloud, smooth=self._smooth)
+
     def probed(self, corrected: bool) -> Cloud:
         """The cloud as those surfaces see it whose light goes on into the cloud.
 
@@ -195,13 +202,18 @@ class Frame:
         return Paths(self.cloud.field, self.cloud.albedo, self.cloud.phase, self.cloud.varying, self.seed)
 
     def _walked(
-        self, sources: Sequence[tuple[LightSource, int]], corrected: bool, seen: Seen, along: NDArray[np.float64]
+        self,
+        sources: Sequence[tuple[LightSource, int]],
+        corrected: bool,
+        seen: Seen,
+        along: NDArray[np.float64],
+        smooth: tuple[LightSource, ...] = (),
     ) -> LightWalks | None:
         """Walks for what is not bright of `sources`, where walks correct the image anyway and those from what is `seen` are short."""
         network = self.cloud.scattering
         if not corrected or not sources or not isinstance(network, NetworkScattering) or network.descriptor.empty or not len(seen.points):
             return None
-        walks = LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade), smooth=True)
+        walks = LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade, smooth), smooth=True)
         some = np.linspace(0, len(seen.points) - 1, _COUNTED).astype(np.int64)
         collisions = walks.collisions(seen.points[some], along[some], np.random.default_rng([self.seed & 0xFFFFFFFF, 0xC011]))
         walks.most = int(min(walks.most, _COLLISIONS_AROUND / max(collisions, 1.0)))
@@ -326,7 +338,10 @@ class Frame:
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
         wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
-        walks = self._walked(self.on_cloud.sources, corrected, seen, self.camera.toward(seen.points))
+        # Surfaces inside of the cloud light it from near by, and each sample would find that anew.
+        sent = self.on_cloud.sources[len(self.on_surfaces.sources) :] if self.on_cloud.shade.inside else ()
+        smooth = tuple(source for source, _ in sent)
+        walks = self._walked(self.on_cloud.sources, corrected, seen, self.camera.toward(seen.points), smooth)
         for source, _ in self.on_cloud.sources:
             around += from_source(self.types, source, beams, isinstance(source, Environment), self.seed)
         power = sum(max(light.irradiance) for light in around)
@@ -355,6 +370,8 @@ class Frame:
             how_far = root, of_around, _BUDGET
             around_it = frame_source(self._roughly, around, eyes, seen, *how_far, until=until, finest=finest, shade=shade)
         found["light from all around"] = around_it
+        if walks is not None and around_it is not None:
+            self._smooth = smooth
         self.named = {name: source for name, source in found.items() if source is not None}
         self.sources = list(self.named.values())
         self.errors = relative_errors(self.sources, seen, looked.columns, looked.rows, self.scene.size)
@@ -388,7 +405,7 @@ class Frame:
             return
         width, height = self.scene.size
         error /= self._weight
-        found = Audit(self.cloud, self.on_cloud, self.sources, self._camera_rays, self._window, self._looked().met, self.seed)
+        found = Audit(self.cloud, self._of_image, self.sources, self._camera_rays, self._window, self._looked().met, self.seed)
         most, at_once, of_thrown = _MOST_TIMED, _TIMED_ROUND, _WALKS_THROWN // 4
         if math.isinf(until):
             # Walks are as noisy as any path: half of the error takes four times as many.
@@ -513,8 +530,10 @@ class Frame:
             light = cloud_light(self.cloud, self.on_cloud, origin, direction, end, numbers, self.counts)
         else:
             sources = self.sources or []
-            depths = self.depths or (_DEPTHS if self.on_cloud.sources or self.sampled else _DEPTHS_SUNS)
-            light = fast_cloud_light(self.cloud, self.on_cloud, sources, origin, direction, end, numbers, self.counts, depths, self.sampled)
+            drawn = len(self.on_cloud.sources) > len(self._smooth)
+            depths = self.depths or (_DEPTHS if drawn or self.sampled else _DEPTHS_SUNS)
+            lights = self._of_image
+            light = fast_cloud_light(self.cloud, lights, sources, origin, direction, end, numbers, self.counts, depths, self.sampled)
         dr.eval(light.direct, light.indirect)
         dr.sync_thread()
         self.spent("cloud", clock)

@@ -34,7 +34,7 @@ class LightWalks:
     cloud, lights
         the medium and all that lights it.
     smooth
-        leave out suns and what is bright of environments.
+        leave out suns and what is bright of environments. Of the sources that `lights` calls smooth single scattering is a part of J.
 
     Attributes
     ----------
@@ -120,6 +120,7 @@ class LightWalks:
             watched=bool(self._lights.sources),
             shaded=shade.surfaces is not None and not shade.inside,
             ends=shade.reach if shade.inside else None,
+            straight=bool(self._lights.smooth),
         )
         if toward is not None and shade.surfaces is not None and not shade.inside:
             arriving = arriving * self._unshaded(escapes.sunlit, toward)[:, None]
@@ -158,16 +159,20 @@ class LightWalks:
         x = vectors_of(types, self._world(take(escapes.position)))
         one = dr.opaque(types.UInt32, 1)
         total = np.zeros((len(lanes), channels))
+        # What is seen straight from the first point is no part of J, but for smooth sources.
+        once_more = np.array(take(escapes.collided), np.float64)[:, None] if self._lights.smooth else np.ones((1, 1))
         for number, (source, _) in enumerate(self._lights.sources):
             numbers = Stratified(types, lanes, dr.full(types.UInt32, number, len(lanes)), one, dr.opaque(types.UInt32, key & 0xFFFFFFFF))
+            counted = 1.0 if source in self._lights.smooth else once_more
             if not isinstance(source, Environment):
-                total += _from_surfaces(types, source, x, direction, numbers.unrelated(), self._lights.shade, len(lanes), channels)
+                light_of = _from_surfaces(types, source, x, direction, numbers.unrelated(), self._lights.shade, len(lanes), channels)
+                total += counted * light_of
                 continue
             light = source.seen(x, direction)
             for part in self._bright:
                 if part.of is source:
                     light = [dr.select(part.part.holds(direction), 0, value) for value in light]
-            total += on_host(light, len(lanes))
+            total += counted * on_host(light, len(lanes))
         for values, weight in zip(result, escapes.weight, strict=True):
             values[where] = total * np.array(take(weight), np.float64)[:, None]
         return result

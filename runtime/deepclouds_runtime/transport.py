@@ -100,11 +100,14 @@ class Lights:
         pairs of a light from many directions and how many of them a sample draws.
     shade
         what the surfaces keep away from the suns.
+    smooth
+        those of the sources whose single scattering is taken for a part of J, and interpolated with it.
     """
 
     suns: tuple[Sun, ...]
     sources: tuple[tuple[LightSource, int], ...]
     shade: Shade
+    smooth: tuple[LightSource, ...] = ()
 
 
 @dataclass
@@ -376,7 +379,7 @@ def single_scattering(
         seen = lights.shade.visible(points, omega)
         light(omega, [dr.select(seen, dr.opaque(types.Float, e), 0) for e in sun.irradiance], 1, far)
     for source, directions in lights.sources:
-        for k in range(directions):
+        for k in range(directions if source not in lights.smooth else 0):
             numbers_of = functools.partial(numbers.number, part=k, parts=directions)
             omega, density = source.sample(numbers_of(stratified.LIGHT_U), numbers_of(stratified.LIGHT_V))
             radiance = [v / (density * directions) for v in source.arriving(points, omega, numbers)]
