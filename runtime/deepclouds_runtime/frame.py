@@ -234,10 +234,11 @@ class Frame:
         """
         types = self.types
         lower, upper = self.cloud.field.volume.bounds
+        unit = self.cloud.scattering.descriptor.unit if isinstance(self.cloud.scattering, NetworkScattering) else 0.0
         if corrected and self._looked().thin:
             # Of it next to all was scattered once or twice and goes on about as the sun's light does, which few directions tell nothing of.
             self._paths = self._traced()
-            self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
+            self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper), unit)
             return
         clock = time.perf_counter()
         middle = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper)))
@@ -280,7 +281,7 @@ class Frame:
             how = _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed, until, self.on_surfaces.shade
             self.all_round = AllRound(self._roughly, lights, seen, ahead[seen.rays], counts[seen.rays], *how)
             self.counts.queries += self.all_round.queries
-            self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper))
+            self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper), unit)
         self.spent("light on surfaces", clock)
 
     def prepare_thrown_back(self, tolerance: float, corrected: bool = False, until: float = math.inf) -> None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime.result import Image
 
-# Pixels that are averaged lie so many apart at most, and on the surface no further than this share of the distance to the cloud's box.
+# Pixels that are averaged lie so many apart at most, and on the surface no further than this share of the distance to the cloud's box, or,
+# near it or inside, of a mean free path.
 _REACH, _NEAR = 3, 0.15
 # Their normals agree so well, and they lie so flat: height above the other's plane over the distance.
 _ALIKE, _FLAT = 0.9, 0.2
@@ -32,10 +33,14 @@ class ThrownLight:
         (width, height) of the image, pixels.
     bounds
         lower and upper corner (3,) of the cloud's box, world.
+    unit
+        about the mean free path in the cloud, world units.
     """
 
-    def __init__(self, types: ModuleType, size: tuple[int, int], bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        self._types, self._size, self._bounds = types, size, bounds
+    def __init__(
+        self, types: ModuleType, size: tuple[int, int], bounds: tuple[NDArray[np.float64], NDArray[np.float64]], unit: float = 0.0
+    ) -> None:
+        self._types, self._size, self._bounds, self._unit = types, size, bounds, unit
         pixels = size[0] * size[1]
         self._light, self._share = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
         self._place, self._normal, self._count = np.zeros((pixels, 3)), np.zeros((pixels, 3)), np.zeros(pixels)
@@ -78,21 +83,23 @@ class ThrownLight:
         lower, upper = (types.Array3f(*(dr.opaque(types.Float, float(v)) for v in corner)) for corner in self._bounds)
         matt = types.Bool(self._count > 0)
         columns, rows = dr.opaque(types.UInt32, width), dr.opaque(types.UInt32, height)
-        found = _averaged(types, columns, rows, light, share, place, normal / dr.maximum(dr.norm(normal), 1e-20), matt, lower, upper)
+        normal /= dr.maximum(dr.norm(normal), 1e-20)
+        unit = dr.opaque(types.Float, self._unit)
+        found = _averaged(types, columns, rows, light, share, place, normal, matt, lower, upper, unit)
         result: Image = np.stack([np.array(v) for v in found], axis=1)
         return result
 
 
 @dr.syntax
 def _averaged(
-    types: Any, width: Any, height: Any, light: Any, share: Any, place: Any, normal: Any, matt: Any, lower: Any, upper: Any
+    types: Any, width: Any, height: Any, light: Any, share: Any, place: Any, normal: Any, matt: Any, lower: Any, upper: Any, unit: Any
 ) -> list[Any]:
     Float, UInt32, Int32, Array3f = types.Float, types.UInt32, types.Int32, types.Array3f
     n = dr.width(light[0])
     pixel = dr.arange(UInt32, n)
     x, y = Int32(pixel % width), Int32(pixel // width)
     outside = dr.maximum(dr.maximum(lower - place, place - upper), 0)
-    near = _NEAR * dr.norm(outside)
+    near = _NEAR * dr.maximum(dr.norm(outside), unit)
     sums = [dr.zeros(Float, n) for _ in range(6)]
     side = 2 * _REACH + 1
     tap = dr.zeros(Int32, n)
