@@ -6,6 +6,7 @@ a sun; and an interpolation of it over the image that is as near as it says.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -225,3 +226,16 @@ def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
         walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
     black = walked_source(Cloud(cloud.field, (0.0, 0.0, 0.0), PHASE, None), network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
     assert black is None
+
+
+def test_single_scattering_of_smooth_sources_is_in_their_walks(types: Any) -> None:
+    """White, in even light, a cloud is invisible: with what was scattered once every walk finds as much as there is all around."""
+    cloud = Cloud(field(types), (1.0,), PHASE, None)
+    even = Environment(types, lambda d: [d.x * 0 + 1.5], np.full((16, 32, 1), 1.5))
+    points, w = points_of(2000)
+    both = Lights((), ((even, 1),), Shade(types, None), (even,))
+    assert LightWalks(cloud, both, smooth=True)(points, w, np.random.default_rng(63)) == pytest.approx(1.5)
+    # The same walks without: those that leave at once find nothing.
+    once_more = LightWalks(cloud, replace(both, smooth=()), smooth=True)(points, w, np.random.default_rng(63))
+    assert set(np.unique(np.round(once_more, 5))) == {0.0, 1.5}
+    assert 0.2 < (once_more > 0).mean() < 0.95
