@@ -156,6 +156,8 @@ class Frame:
         self._pilot: pilot.Pilot | None = None
         # What finds J of the light that a thin cloud throws on surfaces.
         self._paths: Paths | None = None
+        # What finds J of the light that surfaces send back to it.
+        self._probing: Paths | None = None
         # Sources whose single scattering is interpolated.
         self._smooth: tuple[LightSource, ...] = ()
         # What an error of multiple scattering is in the image, of a thin cloud; 1 of others.
@@ -190,13 +192,11 @@ class Frame:
         return replace(self.on_cloud, smooth=self._smooth)
 
     def probed(self, corrected: bool) -> Cloud:
-        """The cloud as those surfaces see it whose light goes on into the cloud.
-
-        Where they lie inside of it that is much light, and from a part of the cloud each: in images that walks correct it is path-traced.
-        """
-        if not (corrected and self.on_surfaces.shade.inside and self.cloud.paths is None):
+        """The cloud as those surfaces see it whose light goes on into the cloud: in images that walks correct that is path-traced."""
+        if not corrected or self.cloud.paths is not None:
             return self.thrower
-        return replace(self.cloud, scattering=None, paths=self._traced(), exact=1)
+        self._probing = self._probing or self._traced()
+        return replace(self.cloud, scattering=None, paths=self._probing, exact=1)
 
     def _traced(self) -> Paths:
         return Paths(self.cloud.field, self.cloud.albedo, self.cloud.phase, self.cloud.varying, self.seed)

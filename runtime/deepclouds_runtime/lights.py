@@ -29,8 +29,8 @@ _PART_SIZE = 0.5
 # Most directions that stand for what is bright of an environment, and how close, in degrees, they are one.
 _MOST_BRIGHT, _TOGETHER = 24, 15.0
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-# Surfaces reach into a box where they do by more than this share of its diagonal.
-_TOUCH = 1e-5
+# Surfaces that are closer to a box than this share of its diagonal are taken to lie inside of it.
+_CLOSE = 0.01
 
 
 class LightSource(Protocol):
@@ -95,7 +95,7 @@ class Shade:
     Attributes
     ----------
     inside
-        whether a surface may lie inside of that box.
+        whether a surface may lie inside of that box, or touch it.
     """
 
     def __init__(self, types: ModuleType, surfaces: Any, bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None) -> None:
@@ -119,9 +119,9 @@ class Shade:
 
 
 def _meets(box: Any, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> bool:
-    """Whether a Mitsuba bounding box reaches into the box between two corners; to touch it from outside is not enough."""
-    margin = _TOUCH * float(np.linalg.norm(upper - lower))
-    return bool(np.all(np.array(box.min, np.float64) < upper - margin) and np.all(np.array(box.max, np.float64) > lower + margin))
+    """Whether a Mitsuba bounding box reaches into the box between two corners, or next to it."""
+    margin = _CLOSE * float(np.linalg.norm(upper - lower))
+    return bool(np.all(np.array(box.min, np.float64) < upper + margin) and np.all(np.array(box.max, np.float64) > lower - margin))
 
 
 class Environment:

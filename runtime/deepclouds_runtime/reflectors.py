@@ -18,11 +18,11 @@ from deepclouds_runtime.surfaces import reflected, reflected_from_cloud
 from deepclouds_runtime.transport import Cloud, Counts, Lights
 
 _PROBE_ROWS = 32
-# Rays into each cell of the table; more where surfaces lie inside of the cloud, which sees them near by.
-_PROBE_PARTS, _PROBE_PARTS_INSIDE = 4, 16
-# Of surfaces inside of the cloud: cells along each edge of its box, rays that look for them, of how many points they start from some, and
-# the samples in a cell that count as much as what is known without them.
-_CELLS, _RAYS, _TRIED, _PRIOR = 32, 1 << 16, 4, 4.0
+# Rays into each cell of the table, of paths, which are noisier, and of predictions.
+_PROBE_PATHS, _PROBE_PARTS = 64, 4
+# Of surfaces inside of the cloud: cells along each edge of its box, which they reach beyond by a share of it; rays that look for surfaces,
+# of how many points they start from some; and the samples in a cell that count as much as what is known without them.
+_CELLS, _BEYOND, _RAYS, _TRIED, _PRIOR = 32, 0.05, 1 << 16, 4, 4.0
 # A sample beside the middle sees lit surfaces where the middle sees the cloud's own shadow: many directions ignore the table.
 _PROBE_UNIFORM = 0.5
 
@@ -61,7 +61,7 @@ class _Inside:
         lane, one = dr.arange(types.UInt32, _RAYS), dr.opaque(types.UInt32, 1)
         numbers = Stratified(types, lane, dr.zeros(types.UInt32, _RAYS), one, dr.opaque(types.UInt32, seed)).unrelated()
         place = plain(types, interaction.p)
-        held = plain(types, interaction.is_valid()) & field.holds_unit(field.to_unit(place))
+        held = plain(types, interaction.is_valid()) & field.holds_unit(self._unit(place))
         weight = dr.select(held, types.Float(1), 0)
         sent = on_host(reflected_from_cloud(cloud, on_cloud, interaction, weight, numbers, counts), _RAYS)
         inside, cell = np.array(held), np.array(self._cell(place, outward(types, interaction, direction)))
@@ -72,14 +72,18 @@ class _Inside:
 
     def better(self, known: list[Any], place: Any, normal: Any) -> list[Any]:
         """The light of each colour channel sent from world points (Array3f) that face `normal`; it is `known` where none was found."""
-        inside = self._field.holds_unit(self._field.to_unit(place))
+        inside = self._field.holds_unit(self._unit(place))
         cell = self._cell(place, normal)
         rest = dr.select(inside, dr.gather(self._types.Float, self._rest, cell, inside), 1)
         return [dr.fma(rest, k, dr.gather(self._types.Float, f, cell, inside)) for k, f in zip(known, self._found, strict=True)]
 
+    def _unit(self, place: Any) -> Any:
+        """World points in the unit cube of the cells."""
+        return (self._field.to_unit(place) + _BEYOND) * (1 / (1 + 2 * _BEYOND))
+
     def _cell(self, place: Any, normal: Any) -> Any:
         types = self._types
-        unit = self._field.to_unit(place)
+        unit = self._unit(place)
         x, y, z = (types.UInt32(dr.clip(v * _CELLS, 0, _CELLS - 1)) for v in (unit.x, unit.y, unit.z))
         size = [dr.abs(v) for v in (normal.x, normal.y, normal.z)]
         first, second = (size[0] >= size[1]) & (size[0] >= size[2]), size[1] >= size[2]
@@ -161,7 +165,7 @@ class Reflectors:
         types: ModuleType = self._types
         rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
         middle = self._probed()
-        cells, parts = rows * columns, _PROBE_PARTS if self._near is None else _PROBE_PARTS_INSIDE
+        cells, parts = rows * columns, _PROBE_PARTS if self._cloud.paths is None else _PROBE_PATHS
         n = cells * parts
         places = np.random.default_rng(seed).random((parts, 2))
         local = np.concatenate([directions_of_cells(rows, columns, (float(u), float(v))).reshape(-1, 3) for u, v in places])

@@ -335,7 +335,8 @@ class Renderer:
             for turn in range(_TURNS if self._interreflection else 0):
                 clock = time.perf_counter()
                 seed = (frame.seed + turn) & 0xFFFFFFFF
-                reflectors = Reflectors(frame.probed(correct), lights, frame.on_cloud, seed, frame.counts)
+                probed = frame.probed(correct and math.isinf(until))
+                reflectors = Reflectors(probed, lights, frame.on_cloud, seed, frame.counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
                 if turn == 0 or math.isinf(until):
