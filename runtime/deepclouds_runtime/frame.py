@@ -441,6 +441,7 @@ class Frame:
         # Not what the film smooths: of that a few samples know little. It takes about as long again, and a few more of them.
         smoothed = self.film.thrown is not None
         trial = replace(self, counts=Counts(), seconds={}, samples=0, errors=None, interreflection=False)
+        trial._smooth = self._smooth
         # Samples that meet nothing cost next to nothing.
         window = self._window if self.scene.surfaces is None else Window.whole(self.scene.size)
         y, x = np.divmod(np.arange(window.count), window.width)

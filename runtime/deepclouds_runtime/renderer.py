@@ -29,7 +29,7 @@ from deepclouds_runtime.result import COLOURS, RenderResult, Statistics
 from deepclouds_runtime.rounds import Watch, fixed_rounds, rounds_for_error, say_ignored
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped
 from deepclouds_runtime.scene import CloudScene
-from deepclouds_runtime.transport import Cloud, Lights
+from deepclouds_runtime.transport import Cloud, Counts, Lights
 
 MODES = ("fast", "reference")
 # A pixel's samples are in flight together.
@@ -336,7 +336,9 @@ class Renderer:
                 clock = time.perf_counter()
                 seed = (frame.seed + turn) & 0xFFFFFFFF
                 probed = frame.probed(correct and math.isinf(until))
-                reflectors = Reflectors(probed, lights, frame.on_cloud, seed, frame.counts)
+                # Walks in the place of queries are none.
+                counts = frame.counts if probed.paths is frame.cloud.paths else Counts()
+                reflectors = Reflectors(probed, lights, frame.on_cloud, seed, counts)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
                 if turn == 0 or math.isinf(until):

@@ -119,6 +119,8 @@ def test_fog_on_the_ground_is_that_of_paths(fog: Path) -> None:
     paths = load(fog, unbiased=True).render(512, 3)
     found = load(fog, predictor=Smooth()).render(64, 4, correct=True)
     assert found.rgb.sum() == pytest.approx(paths.rgb.sum(), rel=0.015)
+    # Walks in the place of queries are not counted.
+    assert found.counts.queries == sum(source["queries"] for source in found.statistics.sources.values())
     tiles = [image.rgb.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)) for image in (found, paths)]
     error = float(np.sqrt(np.mean((tiles[0] - tiles[1]) ** 2)) / tiles[1].mean())
     assert error < 0.03
