@@ -132,7 +132,7 @@ def trace_to_escape(
     shaded
         whether anybody asks for `Escapes.sunlit`.
     ends
-        distance at which opaque surfaces inside of the box end rays: there walks leave the cloud, and no sun is seen past them.
+        distance at which opaque surfaces end rays: inside of the box walks leave the cloud there, and no sun is seen past any of them.
     straight
         whether anybody asks for walks too that leave the cloud straight from their first point: what they see is scattered once.
 
@@ -283,10 +283,8 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         distance, tentative, majorant = field.majorants.step(start, along, distance, u_step, traced)
         unit = dr.fma(along, distance, start)
         inside = traced & field.holds_unit(unit)
-        blocked = Bool(False)
         if ends is not None:
-            blocked = distance >= reach
-            inside &= ~blocked
+            inside &= distance < reach
         rng, thirds = _three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
         hit = inside & tentative & (u_event * majorant < sigma)
@@ -307,7 +305,10 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         if kind.sunlit:
             toward_sun = _phase(lobes, dr.dot(direction, sun))
             of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
-            lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW)) & ~blocked
+            lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
+            if ends is not None:
+                # Surfaces beyond the box shade as well.
+                lit &= ~(reach < np.inf)
             arriving = [value * weight[m] for m in range(m_albedos)]
             for m in range(m_albedos):
                 if varying is not None:
