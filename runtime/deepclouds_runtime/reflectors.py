@@ -27,7 +27,7 @@ _CELLS, _BEYOND, _RAYS, _TRIED, _PRIOR = 32, 0.05, 1 << 16, 4, 4.0
 _PROBE_UNIFORM = 0.5
 
 
-def outward(types: Any, interaction: Any, direction: Any) -> Any:
+def _outward(types: Any, interaction: Any, direction: Any) -> Any:
     """Normals (Array3f) of surfaces that rays hit in unit vectors `direction`, on the side that is hit."""
     normal = plain(types, interaction.n)
     return dr.select(dr.dot(normal, direction) > 0, -normal, normal)
@@ -64,7 +64,7 @@ class _Inside:
         held = plain(types, interaction.is_valid()) & field.holds_unit(self._unit(place))
         weight = dr.select(held, types.Float(1), 0)
         sent = on_host(reflected_from_cloud(cloud, on_cloud, interaction, weight, numbers, counts), _RAYS)
-        inside, cell = np.array(held), np.array(self._cell(place, outward(types, interaction, direction)))
+        inside, cell = np.array(held), np.array(self._cell(place, _outward(types, interaction, direction)))
         cells = 6 * _CELLS**3
         count = np.bincount(cell[inside], minlength=cells)
         self._rest = lanes_of(types.Float, _PRIOR / (count + _PRIOR))
@@ -115,11 +115,12 @@ class Reflectors:
 
     def __init__(self, cloud: Cloud, lights: Lights, on_cloud: Lights, seed: int, counts: Counts) -> None:
         self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
+        lower, upper = cloud.field.volume.bounds
+        self._middle = self._types.Array3f(*(dr.opaque(self._types.Float, float(v)) for v in 0.5 * (lower + upper)))
         self._near = _Inside(cloud, lights, on_cloud, seed, counts) if lights.shade.inside else None
         colours, thrown = self._probe(on_cloud, seed, counts)
         self._table = Environment(self._types, self._nothing, colours, uniform=_PROBE_UNIFORM)
         self._thrown = [lanes_of(self._types.Float, thrown[:, c]) for c in range(thrown.shape[1])]
-        self._middle = self._probed()
         self.sample, self.density, self.beams = self._table.sample, self._table.density, self._table.beams
 
     def arriving(self, points: Any, direction: Any, numbers: Stratified) -> list[Any]:
@@ -133,7 +134,7 @@ class Reflectors:
         there = dr.select(shown, there / dr.maximum(dr.norm(there), 1e-20), direction)
         thrown = [self._table.lookup(table, there) for table in self._thrown]
         if self._near is not None:
-            thrown = self._near.better(thrown, place, outward(self._types, interaction, direction))
+            thrown = self._near.better(thrown, place, _outward(self._types, interaction, direction))
         return [d + dr.select(shown, t, 0) for d, t in zip(direct, thrown, strict=True)]
 
     def reach(self, points: Any, direction: Any) -> Any:
@@ -155,16 +156,10 @@ class Reflectors:
     def _nothing(self, direction: Any) -> list[Any]:
         return [dr.zeros(self._types.Float, dr.width(direction)) for _ in self._cloud.albedo]
 
-    def _probed(self) -> Any:
-        """The box's middle (Array3f)."""
-        lower, upper = self._cloud.field.volume.bounds
-        return self._types.Array3f(*(dr.opaque(self._types.Float, float(v)) for v in 0.5 * (lower + upper)))
-
     def _probe(self, on_cloud: Lights, seed: int, counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Colour (rows, columns, channels) of the surfaces around the box's middle; the cloud's light they send (cells, channels)."""
         types: ModuleType = self._types
         rows, columns = _PROBE_ROWS, 2 * _PROBE_ROWS
-        middle = self._probed()
         cells, parts = rows * columns, _PROBE_PARTS if self._cloud.paths is None else _PROBE_PATHS
         n = cells * parts
         places = np.random.default_rng(seed).random((parts, 2))
@@ -172,7 +167,7 @@ class Reflectors:
         lane, one = dr.arange(types.UInt32, n), dr.opaque(types.UInt32, cells)
         part = lane // one
         numbers = Stratified(types, lane - part * one, part, dr.opaque(types.UInt32, parts), dr.opaque(types.UInt32, seed)).unrelated()
-        interaction = self._seen(dr.zeros(types.Array3f, n) + middle, vectors_of(types, local))
+        interaction = self._seen(dr.zeros(types.Array3f, n) + self._middle, vectors_of(types, local))
         dr.eval(interaction)
         direct = reflected(self._cloud, self._lights, interaction, numbers)
         sent = on_host(reflected_from_cloud(self._cloud, on_cloud, interaction, dr.full(types.Float, 1, n), numbers, counts), n)
