@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -103,7 +104,15 @@ class Descriptor:
         """Bytes of the filtered levels."""
         return sum(level.grid.nbytes for level in self._levels)
 
-    def levels(self, points: Any, w: Any, omega_sun: Any, azimuth: Any | None = None, side: Any | None = None) -> list[Any]:
+    def levels(
+        self,
+        points: Any,
+        w: Any,
+        omega_sun: Any,
+        azimuth: Any | None = None,
+        side: Any | None = None,
+        wanted: Sequence[int] = range(LEVELS),
+    ) -> list[Any]:
         """Stencils of n points, one Dr.Jit array of n * 225 float32 for each level, layout [point][z][y][x], finest level first.
 
         Parameters
@@ -118,11 +127,13 @@ class Descriptor:
             Float, angle in radians that turns the stencil where view and light are parallel (default 0).
         side
             Float, 1 or -1: where -1, the stencil is mirrored across the plane of light and view, which leaves J unchanged (default 1).
+        wanted
+            the levels to build, by default all ten.
         """
         types = self.field.types
         n = dr.width(points, w, omega_sun)
         if self.empty or n == 0:
-            return [dr.zeros(types.Float, n * POINTS) for _ in range(LEVELS)]
+            return [dr.zeros(types.Float, n * POINTS) for _ in wanted]
         x_axis, y_axis, z_axis = self._axes(w, omega_sun, azimuth)
         if side is not None:
             x_axis = x_axis * side
@@ -152,7 +163,7 @@ class Descriptor:
         frame_point = self._to_frame(points - types.Array3f(*(float(v) for v in self._frame.origin)))
         dr.eval(unit_axes, unit_point, frame_axes, frame_point)
         result = []
-        for k in range(LEVELS):
+        for k in wanted:
             if k < self._raw_levels:
                 middle, step = start([a * self._spacings[k] for a in unit_axes], unit_point)
                 values = [self.field.sigma_t_unit(dr.fma(step, i - 2.0, middle)) * self._opaque_unit for i in range(5)]

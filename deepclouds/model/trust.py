@@ -77,10 +77,13 @@ class Trust(BaseModel):
             raise ValueError("quantiles must name the positive distances of at least the shares 0.5 and 0.99")
         return self
 
-    def distance(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> Floats:
-        """Distance (n,) of stencils (n, 10, 225) with rows ``aux`` (n, 6) from the training data: root of the mean square, of order 1."""
+    def distance(self, stencil: NDArray[np.float32], aux: NDArray[np.float32], coarse: NDArray[np.float32] | None = None) -> Floats:
+        """Distance (n,) of stencils (n, 10, 225) with rows ``aux`` (n, 6) from the training data: root of the mean square, of order 1.
+
+        Of levels that the stencils lack, the coarsest ones, `coarse` (n, levels, 2) has what `level_means` makes of them.
+        """
         # Not a matrix product: the threads of a linear algebra library go on spinning for a while and take the tracer's processors.
-        whitened = np.einsum("nk,kl->nl", summaries(stencil, aux) - np.array(self.mean), np.array(self.whitening))
+        whitened = np.einsum("nk,kl->nl", summaries(stencil, aux, coarse) - np.array(self.mean), np.array(self.whitening))
         result: Floats = np.sqrt(np.mean(np.square(whitened), axis=1))
         return result
 
@@ -91,7 +94,12 @@ class Trust(BaseModel):
         return result
 
 
-def summaries(stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> Floats:
+def level_means(stencil: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means (n, levels, 2) of each level of stencils (n, levels, 225) over its points, and over those of its axis toward the light."""
+    return np.stack([stencil.mean(axis=2), stencil[:, :, _AXIS].mean(axis=2)], axis=2)
+
+
+def summaries(stencil: NDArray[np.float32], aux: NDArray[np.float32], coarse: NDArray[np.float32] | None = None) -> Floats:
     """Summaries (n, 27) of queries.
 
     For each level, finest first: the mean over its points, and over those of its axis toward the light, both as the fourth root of the
@@ -102,9 +110,11 @@ def summaries(stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> Floats:
     ----------
     stencil, aux
         the network's inputs, (n, 10, 225) and (n, 6), see docs/contract.md.
+    coarse
+        `level_means` of the coarsest levels, where the stencils lack them.
     """
     n = len(aux)
-    means = np.stack([stencil.mean(axis=2), stencil[:, :, _AXIS].mean(axis=2)], axis=2)
+    means = level_means(stencil) if coarse is None else np.concatenate([level_means(stencil), coarse], axis=1)
     depth = np.maximum(means, 0) * np.exp2(np.arange(LEVELS, dtype=np.float32))[:, None]
     gamma, g1, g2, weight, albedo, log1p_tau = aux.astype(np.float64).T
     phase = weight * _henyey_greenstein(gamma, g1) + (1 - weight) * _henyey_greenstein(gamma, g2)

@@ -264,10 +264,7 @@ class Frame:
             ahead = aims - places
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
             o, d = (vectors_of(types, v) for v in (places, ahead))
-            end = dr.full(types.Float, math.inf, len(places))
-            if self.on_surfaces.shade.inside:
-                end = self.on_surfaces.shade.reach(o, d)
-            seen = seen_by(self.cloud.field, o, d, end, types.Float(0.5), 2)
+            seen = seen_by(self.cloud.field, o, d, self.on_surfaces.shade.reach(o, d), types.Float(0.5), 2)
             # Light on what the camera sees counts in the image, by the cloud's size as seen from there.
             counts = np.square(radius / np.maximum(np.linalg.norm(places - 0.5 * (lower + upper), axis=1), radius))
             counts[len(parts[0][0]) :] = 0

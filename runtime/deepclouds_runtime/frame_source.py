@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from deepclouds.backend import rows, vectors_of
 from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
-from deepclouds_runtime.lights import Beam, LightSource, Shade, on_host
+from deepclouds_runtime.lights import Beam, LightSource, Shade
 from deepclouds_runtime.march import depths
-from deepclouds_runtime.octree import DeviceOctree, Octree, Statistics, lattice_around, root_nodes
-from deepclouds_runtime.scattering import Albedos, NetworkScattering
+from deepclouds_runtime.octree import DeviceOctree, Lattice, Octree, Statistics, lattice_around, root_nodes
+from deepclouds_runtime.predicted import Predicted
+from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import Cloud, opacity_of, taker
@@ -32,11 +33,6 @@ Array = NDArray[Any]
 _LEVELS = 7
 # Points at which the interpolation is measured.
 _CHECKS, _LEAST_CHECKS = 512, 64
-# Queries that are prepared together.
-_AT_ONCE = 16384
-_DEEP = 1e6
-# Places around a point that tell what an albedo is there on the mean, and how far away they lie, in units of length.
-_AROUND, _REACH = 32, 2.0
 # Of a budget of queries, what the corners of the coarsest cells may take.
 _OVERDRAWN = 4
 # Nodes behind a surface stand this share of the way to it.
@@ -63,6 +59,8 @@ class FrameSource:
         this mean, over all channels.
     queries
         asked of the network.
+    shared
+        how many of them took what the network makes of coarse levels from corners around.
     lights
         directions that light comes from.
     model
@@ -78,6 +76,7 @@ class FrameSource:
     statistics: Statistics
     error: float
     queries: int
+    shared: int
     lights: int
     model: str = ""
     doubt: DeviceOctree | None = None
@@ -120,6 +119,7 @@ class FrameSource:
             "lights": self.lights,
             "nodes": made.nodes,
             "queries": self.queries,
+            "shared": self.shared,
             "refined": made.cells,
             "error": round(self.error, 4),
         }
@@ -284,7 +284,7 @@ def frame_source(
     albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
     if not albedos or not lights or not len(seen.points) or not isinstance(network, NetworkScattering) or network.descriptor.empty:
         return None
-    predicted = _Predicted(cloud, network, lights, albedos, eyes, combine)
+    predicted = Predicted(cloud, network, lights, albedos, eyes, combine)
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     checks = max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes)))
     how = cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until
@@ -296,7 +296,7 @@ class Evaluates(Protocol):
 
     Attributes
     ----------
-    mix, queries, model
+    mix, queries, shared, model
         see `FrameSource`.
     carried
         so many of the fields are not J but the sum of the others and the error to expect of it.
@@ -304,11 +304,16 @@ class Evaluates(Protocol):
 
     mix: Array
     queries: int
+    shared: int
     model: str
     carried: int
 
     def __call__(self, points: Array) -> Array:
         """Fields (n, l), float32, at world points (n, 3)."""
+        ...
+
+    def on_lattice(self, lattice: Lattice, levels: int) -> None:
+        """Is told the coarsest cells before their corners are asked for, all at once, and how often they may be split."""
         ...
 
 
@@ -362,6 +367,7 @@ def interpolated(
         if corners <= most or lattice.size.max() <= 2:
             break
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
+    evaluate.on_lattice(lattice, levels)
     place = _BeforeSurfaces(field.types, shade) if shade is not None and shade.surfaces is not None else None
     how = tolerance, nodes, levels, evaluate.carried, paced.affordable, place
     octree = Octree(lattice, paced, built_for.points, built_for.weights, *how)
@@ -369,9 +375,8 @@ def interpolated(
     factor, error, means = _audit(device, true, held_out, every)
     level = float(means @ evaluate.mix.mean(axis=0)) if len(means) == evaluate.mix.shape[1] else 1.0
     doubt = octree.upload(field.types, carried=True) if evaluate.carried else None
-    return FrameSource(
-        device, evaluate.mix * factor, octree.statistics, error, evaluate.queries, lights, evaluate.model, doubt, octree, level
-    )
+    asked = evaluate.queries, evaluate.shared, lights, evaluate.model
+    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, *asked, doubt, octree, level)
 
 
 def part_of_time(until: float, share: float) -> float:
@@ -418,113 +423,6 @@ class _Paced:
         """By the pace of the last call."""
         left = self._until - time.perf_counter()
         return _UNLIMITED if math.isinf(left) else int(max(left, 0.0) / max(self._pace, 1e-9))
-
-
-class _Predicted:
-    """What the octree interpolates: the network's j summed over lights, one field for each different albedo or for each colour channel."""
-
-    def __init__(
-        self,
-        cloud: Cloud,
-        network: NetworkScattering,
-        lights: Sequence[Arriving],
-        albedos: tuple[float, ...],
-        eyes: Sequence[Sees],
-        combine: Callable[[Array], Array],
-    ) -> None:
-        self._cloud, self._network, self._lights, self._albedos, self._eyes, self._combine = cloud, network, lights, albedos, eyes, combine
-        self.queries = 0
-        path = getattr(network.predictor, "path", None)
-        self.model = "" if path is None else path.stem
-        # What one eye sees is looked at itself; of several, only mixtures are.
-        self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
-        square = np.array(cloud.albedo) ** 2 / (4 * math.pi)
-        tint = _tint(lights) if cloud.varying is None else None
-        self._brightest = -1
-        # Which of the albedos each field belongs to.
-        self._of_field = [albedos.index(a) if a > 0 else -1 for a in cloud.albedo]
-        if cloud.varying is not None:
-            # Its albedos are part of each field.
-            self.mix, self._of_field = np.eye(len(cloud.albedo)) / (4 * math.pi), list(range(len(cloud.albedo)))
-        elif tint is None:
-            self.mix = np.diag(square)
-        else:
-            self._brightest = int(np.argmax(tint))
-            self.mix = np.zeros((len(cloud.albedo), len(albedos)))
-            for c, k in enumerate(self._of_field):
-                if k >= 0:
-                    self.mix[c, k] = square[c] * tint[c] / tint[self._brightest]
-            self._of_field = list(range(len(albedos)))
-
-    def __call__(self, points: Array) -> Array:
-        """Fields (n, l) at world points (n, 3); the last `carried` of them are the sum of the others and the error to expect of it."""
-        n = len(points)
-        total = np.zeros((len(self._eyes), n, self.mix.shape[1]), np.float32)
-        error = np.zeros(n, np.float32)
-        pairs = [(e, light) for e in range(len(self._eyes)) for light in self._lights]
-        at_once = max(1, _AT_ONCE // max(n, 1))
-        for first in range(0, len(pairs), at_once):
-            self._add(points, pairs[first : first + at_once], total, error)
-        combined = self._combine(total)
-        return np.concatenate([combined, combined.sum(axis=1, keepdims=True), error[:, None]], axis=1) if self.carried else combined
-
-    def _add(self, points: Array, pairs: Sequence[tuple[int, Arriving]], total: Array, error: Array) -> None:
-        types, field, n = self._cloud.field.types, self._cloud.field, len(points)
-        x = vectors_of(types, np.tile(points, (len(pairs), 1)))
-        d = vectors_of(types, np.concatenate([self._eyes[e].toward(points) for e, _ in pairs]))
-        omega = vectors_of(types, np.repeat([light.omega for _, light in pairs], n, axis=0))
-        tau = optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Bool(True), _DEEP)
-        dr.eval(tau)
-        albedos, columns, square = self._at(points, len(pairs))
-        query = x, d, omega, self._cloud.phase, albedos, tau
-        j, errors = self._network.with_errors(*query) if self.carried else (self._network(*query), None)
-        self.queries += j.size
-        errors = np.zeros_like(j) if errors is None else errors
-        j, errors = (v[:, columns].reshape(len(pairs), n, -1) * square for v in (j, errors))
-        x = vectors_of(types, points)
-        for (e, light), values, expected in zip(pairs, j, errors, strict=True):
-            arriving = light.at(x)
-            dr.eval(arriving)
-            for f, k in enumerate(self._of_field):
-                if k >= 0:
-                    irradiance = np.array(arriving[f if self._brightest < 0 else self._brightest])
-                    total[e, :, f] += irradiance * values[:, k]
-                    # Errors of several lights add up: what makes a network err under one sun does so under the next.
-                    error += irradiance * expected[:, k]
-
-    def _at(self, points: Array, times: int) -> tuple[Albedos, list[int], Array]:
-        """The albedos to ask for at points that are repeated, which of them each field has, and what its values are multiplied by.
-
-        A network knows one albedo a query. Where it varies, that is its mean over the medium around the point: walks correct the rest.
-        """
-        varying, field = self._cloud.varying, self._cloud.field
-        if varying is None:
-            return self._albedos, list(range(len(self._albedos))), np.ones(1)
-        types, n = field.types, len(points)
-        own = on_host(self._cloud.albedo_at(vectors_of(types, points)), n)
-        around = np.random.default_rng(_AROUND).normal(size=(_AROUND, 3)) * (_REACH * self._network.descriptor.unit)
-        places = vectors_of(types, (points[:, None] + around).reshape(-1, 3))
-        sigma = np.array(field.sigma_t(places), np.float64).reshape(n, _AROUND, 1)
-        # Where nothing is near, as if there were.
-        sigma += 1e-3 * max(field.majorant, 1e-30)
-        mean = (on_host(varying(places), n * _AROUND).reshape(n, _AROUND, -1) * sigma).sum(axis=1) / sigma.sum(axis=1)
-        columns: list[int] = []
-        albedos: list[Array] = []
-        for c in range(mean.shape[1]):
-            same = [k for k in range(c) if np.array_equal(mean[:, k], mean[:, c])]
-            columns.append(columns[same[0]] if same else len(albedos))
-            if not same:
-                albedos.append(np.clip(np.tile(mean[:, c], times), 0, 1))
-        return albedos, columns, own * mean
-
-
-def _tint(lights: Sequence[Arriving]) -> Array | None:
-    """Colour that all lights share, or None where their colours differ."""
-    if not all(light.plain for light in lights):
-        return None
-    irradiance = np.array([light.irradiance for light in lights], np.float64)
-    tint = irradiance[0] / irradiance[0].max()
-    return tint if np.allclose(irradiance, irradiance.max(axis=1, keepdims=True) * tint, rtol=1e-5) else None
 
 
 def _split(seen: Seen, count: int) -> tuple[Seen, Seen]:

@@ -20,7 +20,7 @@ from deepclouds.backend import lanes_of
 
 Array = NDArray[Any]
 # Corners of the unit cube, x fastest.
-_CORNERS = np.array([(i & 1, (i >> 1) & 1, (i >> 2) & 1) for i in range(8)], np.int64)
+CORNERS = np.array([(i & 1, (i >> 1) & 1, (i >> 2) & 1) for i in range(8)], np.int64)
 # A lattice coordinate keeps 21 bits, three of them make a key of 63.
 _BITS = 21
 _MOST_CELLS_A_SIDE = 64
@@ -113,7 +113,7 @@ def root_nodes(lattice: Lattice, points: Array, enough: int) -> int:
     cells = np.zeros(tuple(lattice.size), bool)
     cells[tuple(np.clip(lattice.local(points), 0, lattice.size - 1e-6).astype(np.int64).T)] = True
     corners = np.zeros(tuple(lattice.size + 1), bool)
-    for x, y, z in _CORNERS:
+    for x, y, z in CORNERS:
         corners[x : x + cells.shape[0], y : y + cells.shape[1], z : z + cells.shape[2]] |= cells
     return int(corners.sum())
 
@@ -212,7 +212,7 @@ class Octree:
             parents, before, blocks = coordinates[split], values[split], int(split.sum())
             child = (local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[member]
             member = 8 * member + child @ (1, 2, 4)
-            coordinates = (2 * parents[:, None] + _CORNERS).reshape(-1, 3)
+            coordinates = (2 * parents[:, None] + CORNERS).reshape(-1, 3)
             near = np.repeat(near[split], 8, axis=0)
             near[member] = points
             continued = np.einsum("oci,pik->pock", _CHILD_WEIGHTS, before[..., : self.fields]).reshape(8 * blocks, 8, self.fields)
@@ -237,13 +237,13 @@ class Octree:
         """Mean value over the points, of the largest field."""
         fraction = local * 2.0**level - coordinates[member]
         mean = (
-            np.einsum("pc,pck->pk", _trilinear(fraction), values[member][..., : self.fields]).T @ weights / max(float(weights.sum()), 1e-30)
+            np.einsum("pc,pck->pk", trilinear(fraction), values[member][..., : self.fields]).T @ weights / max(float(weights.sum()), 1e-30)
         )
         return float(mean.max(initial=0.0))
 
     def _corner_values(self, coordinates: Array, level: int, near: Array) -> Array:
         """Values (m, 8, k) at the corners of cells (m, 3) of a level, with a point (m, 3) in or near each; unknown ones are asked for."""
-        corners = (coordinates[:, None] + _CORNERS) << (self._levels - level)
+        corners = (coordinates[:, None] + CORNERS) << (self._levels - level)
         keys = corners[..., 0] | corners[..., 1] << _BITS | corners[..., 2] << 2 * _BITS
         unique: Array
         unique, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
@@ -269,7 +269,7 @@ class Octree:
         nx, ny, nz = (int(n) + 1 for n in self.lattice.size)
         grid = np.zeros((nz, ny, nx, values.shape[2]), np.float32)
         filled = np.zeros((nz, ny, nx), bool)
-        corners = (coordinates[:, None] + _CORNERS).reshape(-1, 3)
+        corners = (coordinates[:, None] + CORNERS).reshape(-1, 3)
         grid[corners[:, 2], corners[:, 1], corners[:, 0]] = values.reshape(len(corners), -1)
         filled[corners[:, 2], corners[:, 1], corners[:, 0]] = True
         while filled.any() and not filled.all():
@@ -284,7 +284,7 @@ class Octree:
             grid[fill] = total[fill] / count[fill][:, None]
             filled |= fill
         z, y, x = (a.ravel() for a in np.meshgrid(np.arange(nz - 1), np.arange(ny - 1), np.arange(nx - 1), indexing="ij"))
-        all_corners = np.stack([x, y, z], axis=1)[:, None] + _CORNERS
+        all_corners = np.stack([x, y, z], axis=1)[:, None] + CORNERS
         result: Array = grid[all_corners[..., 2], all_corners[..., 1], all_corners[..., 0]]
         return result
 
@@ -309,7 +309,7 @@ class Octree:
             world points (n, 3) where the values are asked for, and how much each counts.
         """
         leaves = self._leaves[..., : self.fields]
-        local = (self._corners[:, None] + self._edges[:, None, None] * _CORNERS).reshape(-1, 3)
+        local = (self._corners[:, None] + self._edges[:, None, None] * CORNERS).reshape(-1, 3)
         keys = np.rint(local * 2.0**self._levels).astype(np.int64) @ (1, 1 << _BITS, 1 << 2 * _BITS)
         _, first, node = np.unique(keys, return_index=True, return_inverse=True)
         node = node.reshape(leaves.shape[:2])
@@ -338,7 +338,7 @@ class Octree:
             octant = (place[inner] >= 0.5).astype(np.int64)
             place[inner] = 2 * place[inner] - octant
             leaf[inner] = self._table[octant @ (1, 2, 4) - leaf[inner]]
-        return leaf, _trilinear(place)
+        return leaf, trilinear(place)
 
 
 class DeviceOctree:
@@ -399,11 +399,11 @@ def _worst(squared: Array, allowed: float) -> Array:
     return split
 
 
-def _trilinear(fraction: Array) -> Array:
+def trilinear(fraction: Array) -> Array:
     """Weights (n, 8) of the corners at places (n, 3) in the unit cube."""
-    weights: Array = np.where(_CORNERS == 1, fraction[:, None], 1 - fraction[:, None]).prod(axis=2)
+    weights: Array = np.where(CORNERS == 1, fraction[:, None], 1 - fraction[:, None]).prod(axis=2)
     return weights
 
 
 # Corner c of child o of a cell, as a mixture of the cell's own corners: (octant, corner, parent's corner).
-_CHILD_WEIGHTS = np.stack([_trilinear(0.5 * (_CORNERS[o] + _CORNERS)) for o in range(8)]).astype(np.float32)
+_CHILD_WEIGHTS = np.stack([trilinear(0.5 * (CORNERS[o] + CORNERS)) for o in range(8)]).astype(np.float32)

@@ -16,6 +16,7 @@ from deepclouds.errors import InputError
 from deepclouds.medium.phase import ordered_lobes
 from deepclouds.model import AUX, INPUT_AUX, INPUT_STENCIL, LEVELS, OUTPUT, POINTS, ModelMetadata, aux_inputs, initialiser_hash
 from deepclouds.model.trust import FLOOR
+from deepclouds_runtime.shared_levels import cut, halves, read_levels
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -47,6 +48,8 @@ class Predictor:
         the file.
     metadata
         what the file says about itself.
+    read
+        levels of a stencil that the network looks at, finest first.
 
     Raises
     ------
@@ -63,6 +66,9 @@ class Predictor:
         proto = _parse(data, self.path)
         self.metadata = _checked_metadata(proto, self.path)
         self._session = _session(data, self.path)
+        self.read = read_levels(proto)
+        self._data = data
+        self._halves: dict[int, Halves | None] = {}
         # Several threads in one small product wait for each other most of the time; each has a batch of its own.
         self._threads = ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="predictor")
 
@@ -78,24 +84,50 @@ class Predictor:
         n = len(aux)
         if stencil.shape != (n, LEVELS, POINTS) or aux.shape != (n, len(AUX)):
             raise ValueError(f"expected (n, {LEVELS}, {POINTS}) and (n, {len(AUX)}), got {stencil.shape} and {aux.shape}")
-        j = np.empty(n, np.float32)
+        j = self._run(self._session, {INPUT_STENCIL: stencil, INPUT_AUX: aux}, 1)[0]
+        return self._finite(j)
 
-        def run(start: int) -> None:
-            rows = slice(start, start + BATCH)
-            j[rows] = self._session.run([OUTPUT], {INPUT_STENCIL: stencil[rows], INPUT_AUX: aux[rows]})[0]
+    def halves(self, shared: int) -> Halves | None:
+        """The network cut in two where it has seen the `shared` coarsest levels; None where it cannot be cut there."""
+        if shared not in self._halves:
+            proto = _parse(self._data, self.path)
+            tensor = cut(proto, shared)
+            sessions = None if tensor is None else tuple(_session(part, self.path) for part in halves(proto, tensor))
+            self._halves[shared] = None if tensor is None or sessions is None else Halves(self, shared, tensor, sessions)
+        return self._halves[shared]
 
-        for _ in self._threads.map(run, range(0, n, BATCH)):
-            pass
+    def _run(self, session: Any, inputs: dict[str, NDArray[np.float32]], outputs: int) -> list[NDArray[np.float32]]:
+        """All outputs of a graph, in batches, one a thread."""
+        n = len(inputs[INPUT_AUX])
+        found: list[list[NDArray[np.float32]]] = [[] for _ in range(outputs)]
+
+        def run(start: int) -> list[NDArray[np.float32]]:
+            result: list[NDArray[np.float32]] = session.run(None, {k: v[start : start + BATCH] for k, v in inputs.items()})
+            return result
+
+        for part in self._threads.map(run, range(0, n, BATCH)):
+            for values, value in zip(found, part, strict=True):
+                values.append(value)
+        return [np.concatenate(values) if values else np.empty(0, np.float32) for values in found]
+
+    def _finite(self, j: NDArray[np.float32]) -> NDArray[np.float32]:
         # The graph clamps its inputs, so only NaN gets through, from an input to the output or out of damaged weights.
         if not np.all(np.isfinite(j)):
             bad = np.count_nonzero(~np.isfinite(j))
-            raise ValueError(f"{bad} of {n} predictions of {self.path} are not finite; check the inputs for NaN")
+            raise ValueError(f"{bad} of {len(j)} predictions of {self.path} are not finite; check the inputs for NaN")
         return j
 
-    def errors(self, stencil: NDArray[np.float32], aux: NDArray[np.float32], j: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    def errors(
+        self,
+        stencil: NDArray[np.float32],
+        aux: NDArray[np.float32],
+        j: NDArray[np.float32],
+        coarse: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32] | None:
         """Errors (n,) to expect of predictions j (n,): root of the mean square, in units of j; None for a model that knows none.
 
-        They rise with the distance from the training data and are calibrated on held-out labels: `deepclouds.model.trust`.
+        They rise with the distance from the training data and are calibrated on held-out labels: `deepclouds.model.trust`. Of levels
+        that the stencils lack `coarse` has the means, see `deepclouds.model.trust.level_means`.
         """
         trust = self.metadata.trust
         if trust is None:
@@ -104,7 +136,8 @@ class Predictor:
         # What one batch reads again is still in the cache.
         for start in range(0, len(j), BATCH):
             rows = slice(start, start + BATCH)
-            result[rows] = trust.expected_error(trust.distance(stencil[rows], aux[rows]), j[rows]) * (j[rows] + FLOOR)
+            distance = trust.distance(stencil[rows], aux[rows], None if coarse is None else coarse[rows])
+            result[rows] = trust.expected_error(distance, j[rows]) * (j[rows] + FLOOR)
         return result
 
     def out_of_range(self, aux: NDArray[np.float32]) -> dict[str, int]:
@@ -144,6 +177,36 @@ class Predictor:
             if not low * (1 - _SLACK_SIZE) <= size <= high * (1 + _SLACK_SIZE):
                 found["size"] = f"a cloud of {size:.3g} mean free paths (trained on {low:g} to {high:g})"
         return list(found.values())
+
+
+class Halves:
+    """A network cut in two, see `deepclouds_runtime.shared_levels`.
+
+    Parameters
+    ----------
+    whole
+        the network.
+    shared
+        coarse levels that the first half sees.
+    tensor
+        name of what it hands on.
+    sessions
+        both halves; the first gives j too.
+    """
+
+    def __init__(self, whole: Predictor, shared: int, tensor: str, sessions: Sequence[Any]) -> None:
+        self._whole, self.shared, self._tensor = whole, shared, tensor
+        self._first, self._second = sessions
+
+    def begin(self, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """J (n,) as `Predictor.predict` has it, and what the network made of the coarse levels (n, width)."""
+        j, latent = self._whole._run(self._first, {INPUT_STENCIL: stencil, INPUT_AUX: aux}, 2)
+        return self._whole._finite(j), latent
+
+    def finish(self, latent: NDArray[np.float32], stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> NDArray[np.float32]:
+        """J (n,) of what the network made of the coarse levels (n, width), the fine levels of stencils, and aux rows (n, 6)."""
+        inputs = {INPUT_STENCIL: np.ascontiguousarray(stencil, np.float32), INPUT_AUX: aux, self._tensor: latent}
+        return self._whole._finite(self._whole._run(self._second, inputs, 1)[0])
 
 
 @lru_cache(maxsize=2)

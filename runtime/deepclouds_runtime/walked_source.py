@@ -15,7 +15,7 @@ import numpy as np
 from deepclouds_runtime.frame_source import FrameSource, Seen, Sees, interpolated
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import Shade
-from deepclouds_runtime.octree import Array
+from deepclouds_runtime.octree import Array, Lattice
 from deepclouds_runtime.scattering import NetworkScattering, Stopped
 from deepclouds_runtime.transport import Cloud
 
@@ -88,7 +88,7 @@ class _Walked:
         self.mix: Array = np.eye(channels)
         # What one eye sees is looked at itself; of several, only mixtures are.
         self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
-        self.queries, self.model, self.each = 0, "", _TRIALS if len(eyes) == 1 else _EACH_EYE
+        self.queries, self.shared, self.model, self.each = 0, 0, "", _TRIALS if len(eyes) == 1 else _EACH_EYE
 
     def choose(self, seen: Seen) -> None:
         """Set how many walks start at a node, from a trial at what the camera sees."""
@@ -99,6 +99,9 @@ class _Walked:
         if level > 0:
             needed = float(variance.mean()) * _TRIALS / (_NOISE * level) ** 2
             self.each = int(np.clip(2 ** np.ceil(np.log2(max(needed, 1.0))), _FEWEST, _MOST))
+
+    def on_lattice(self, lattice: Lattice, levels: int) -> None:
+        """Nothing is shared between points."""
 
     def __call__(self, points: Array) -> Array:
         """Fields (n, l) at world points (n, 3); the last `carried` of them are the sum of the others and its standard deviation."""
