@@ -59,10 +59,6 @@ def _audit_rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "error of the network, measured", _measured(found["network"])
     if found["corrected"]:
         yield "error once corrected, measured", _measured(found["remaining"])
-    if found.get("thrown"):
-        factors, deviations = (", ".join(f"{v:.3g}" for v in dict.fromkeys(found["thrown"][name])) for name in ("factor", "deviation"))
-        instead = "path-traced, or the prediction would be " if found["thrown"].get("traced") else ""
-        yield "light thrown on surfaces", f"{instead}multiplied by {factors} (walks; standard deviation {deviations})"
     yield "walks that measured it", f"{found['walks']:,}" + ("" if found["corrected"] else ", no correction made")
 
 

@@ -4,7 +4,8 @@ A surface sees each point of the cloud from another direction than the camera do
 has damped what varies fast, by g^l in the order l of spherical harmonics. So J is predicted at the nodes of a coarse octree in a few
 directions spread over the sphere, and kept as spherical harmonics up to order 2, fitted by least squares.
 
-What that leaves out is the part of a strong forward peak that light scattered twice still has: less than the light that is thrown.
+What that leaves out is the part of a strong forward peak that light scattered a few times still has. Where there is one, these orders of
+the light that is thrown are sampled (`Frame`), and harmonics tell what comes after them.
 """
 
 from __future__ import annotations
@@ -17,20 +18,15 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import vectors_of
-from deepclouds_runtime.correction import FLOOR
-from deepclouds_runtime.frame_source import Arriving, Seen, frame_source, part_of_time
-from deepclouds_runtime.light_walks import LightWalks
-from deepclouds_runtime.lights import Shade, on_host
-from deepclouds_runtime.scattering import NetworkScattering
+from deepclouds_runtime.frame_source import Arriving, Seen, frame_source
+from deepclouds_runtime.lights import Shade
 from deepclouds_runtime.transport import Cloud
-from deepclouds_runtime.walked_source import walked_source
 
 Array = NDArray[Any]
 DIRECTIONS = 16
-# Walks in the place of a query of the budget.
-_WALKS_A_QUERY = 16
-_HARMONICS = 9
+# Of spherical harmonics.
+ORDER = 2
+_HARMONICS = (ORDER + 1) ** 2
 
 
 class Direction:
@@ -53,16 +49,10 @@ class AllRound:
         the medium; its `scattering` is the network.
     lights
         where light comes from.
-    seen, along
-        points of the cloud that surfaces see, and the directions (n, 3) in which they see them.
-    counts
-        (n,) how much the light from there counts in the image.
+    seen
+        points of the cloud that surfaces see.
     root, tolerance, budget, until, shade
         see `frame_source`.
-    walks
-        estimate J of more light, at nodes of their own; None for no more.
-    seed
-        of their random numbers.
 
     Attributes
     ----------
@@ -70,9 +60,7 @@ class AllRound:
         harmonics of J at the nodes; none where it is 0 everywhere.
     queries
         asked of the network.
-    factor
-        of each colour channel, by which J is multiplied; 1 until walks say better.
-    seen, along, counts
+    seen
         as given.
     again
         J under further lights, which is added.
@@ -83,37 +71,26 @@ class AllRound:
         cloud: Cloud,
         lights: Sequence[Arriving],
         seen: Seen,
-        along: Array,
-        counts: Array,
         root: float,
         tolerance: float,
         budget: int,
-        walks: LightWalks | None = None,
-        seed: int = 0,
         until: float = math.inf,
         shade: Shade | None = None,
     ) -> None:
         eyes = [Direction(w) for w in spread(DIRECTIONS)]
-        walked = walks is not None and isinstance(cloud.scattering, NetworkScattering)
-        first = part_of_time(until, 0.5) if walked else until
-        found = [frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, first, shade=shade)]
-        if walks is not None and isinstance(cloud.scattering, NetworkScattering):
-            most = min(_WALKS_A_QUERY * budget, walks.most)
-            how = most, seed, fit, _HARMONICS, until
-            found.append(walked_source(cloud, cloud.scattering, walks, eyes, seen, root, tolerance, *how, shade=shade))
-        self.sources = [source for source in found if source is not None]
+        source = frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, until, shade=shade)
+        self.sources = [] if source is None else [source]
         self._channels, self._types = len(cloud.albedo), cloud.field.types
         self.queries = sum(source.queries for source in self.sources)
-        self.seen, self.along, self.counts = seen, along, counts
+        self.seen = seen
         self.again: AllRound | None = None
-        self.factor = np.ones(self._channels)
 
     def __call__(self, points: Any, w: Any) -> list[Any]:
         """J of every colour channel at points (Array3f) seen along unit vectors `w`."""
         total = self._own(points, w)
         if self.again is not None:
             total = [a + b for a, b in zip(total, self.again(points, w), strict=True)]
-        return [value * dr.opaque(self._types.Float, float(f)) for value, f in zip(total, self.factor, strict=True)]
+        return total
 
     def _own(self, points: Any, w: Any) -> list[Any]:
         total = [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
@@ -127,30 +104,6 @@ class AllRound:
                 sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
             total = [a + b for a, b in zip(total, source.colours(sums), strict=True)]
         return total
-
-    def correct(self, walks: LightWalks, count: int, seed: int) -> dict[str, Any]:
-        """Set `factor` by `count` walks from points that surfaces see; returns it and its standard deviation, for a report.
-
-        The factor is the ratio of the means of what walks find and of what is predicted, drawn toward 1 as far as chance explains it.
-        """
-        points, along, weights = self.seen.points, self.along, self.seen.weights * self.counts
-        if not self.sources or not weights.sum() > 0:
-            return {}
-        x, w = vectors_of(self._types, points), vectors_of(self._types, along)
-        predicted = on_host(self(x, w), len(points))
-        level = predicted.mean(axis=1)
-        wanted = weights * (level + max(FLOOR * float(np.average(level, weights=weights)), 1e-30))
-        total = np.cumsum(wanted)
-        random = np.random.default_rng([seed & 0xFFFFFFFF, 0x7420])
-        place = (np.arange(count) + random.random()) / count * total[-1]
-        drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
-        found = walks(points[drawn], along[drawn], random)
-        each = (weights[drawn] * (total[-1] / wanted[drawn]))[:, None]
-        below = np.maximum((each * predicted[drawn]).mean(axis=0), 1e-30)
-        residual = each * (found - predicted[drawn]) / below
-        mean, variance = residual.mean(axis=0), residual.var(axis=0) / count
-        self.factor = self.factor * np.maximum(1 + mean * np.maximum(1 - variance / np.maximum(np.square(mean), 1e-30), 0), 0)
-        return {"factor": [round(float(f), 5) for f in self.factor], "deviation": [round(float(v), 5) for v in np.sqrt(variance)]}
 
 
 def spread(count: int) -> Array:

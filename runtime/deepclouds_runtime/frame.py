@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import math
@@ -18,7 +19,7 @@ from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime import pilot
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.adaptive import DARK, Adaptive
-from deepclouds_runtime.all_round import AllRound, spread
+from deepclouds_runtime.all_round import ORDER, AllRound, spread
 from deepclouds_runtime.audit import FEWEST, MOST, ROUND, WALKS_A_PIXEL, WALKS_A_SIGHT, Audit, audited
 from deepclouds_runtime.camera import Camera, Window
 from deepclouds_runtime.confidence import confidence, relative_errors
@@ -78,15 +79,15 @@ _TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 4096, 0.04, 0.5, 4.0
 _CORRECTED, _THROWN = 1.6, 4.0
 # Rays from a sample of a surface that look for this light, where they are short: it is noisier than all else in a sample.
 _RAYS_THROWN = 2
-# Walks that correct the light thrown on surfaces, by a single number, and the largest that is believed.
-_WALKS_THROWN, _MOST_WRONG = 1 << 17, 1.5
+# Orders of scattering of that light that are sampled at most, and what may be left of a peak in what is scattered more often.
+_MOST_EXACT, _PEAK = 3, 0.15
 # Collisions of a camera ray that get shadow rays; under suns alone, where these are all that they cost, more: along a ray noise falls with
 # their number, not with its root.
 _DEPTHS, _DEPTHS_SUNS = 4, 8
 # Most walks where the time decides, and by how much longer than a trial says samples take: rounds end before the time does.
 _MOST_TIMED, _SLOWER = 1 << 26, 1.3
 # There walks come in smaller rounds, and there are none unless there are so many seconds for them; those for thrown light need more.
-_TIMED_ROUND, _LEAST_AUDIT, _LEAST_THROWN = 1 << 15, 0.25, 1.5
+_TIMED_ROUND, _LEAST_AUDIT = 1 << 15, 0.25
 # Of more pixels than these a trial takes one in sixteen, else one in four.
 _MANY_PIXELS = 1 << 16
 # Of an error that is missed because of the network: samples cost less than the walks that would bring that down.
@@ -184,7 +185,20 @@ class Frame:
         """The cloud as surfaces see it."""
         if self._paths is not None:
             return replace(self.cloud, scattering=None, paths=self._paths, exact=1)
-        return self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=1)
+        return (
+            self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=self._exact_thrown)
+        )
+
+    @functools.cached_property
+    def _exact_thrown(self) -> int:
+        """Orders of thrown light that are sampled: harmonics know the others, from which the phase function has taken the peaks."""
+        bright = any(isinstance(s, Environment) and s.bright_part(BRIGHT) is not None for s, _ in self.on_cloud.sources)
+        if not self.on_cloud.suns and not bright:
+            return 1
+        first, second, share = self.cloud.phase
+        g = max(abs(first) if share > 0 else 0.0, abs(second) if share < 1 else 0.0)
+        # Of light scattered n + 1 times harmonics of order l have what g^(l (n + 1)) leaves of them.
+        return next((n for n in range(1, _MOST_EXACT) if g ** ((ORDER + 1) * (n + 1)) < _PEAK), _MOST_EXACT)
 
     @property
     def _of_image(self) -> Lights:
@@ -235,8 +249,9 @@ class Frame:
         types = self.types
         lower, upper = self.cloud.field.volume.bounds
         unit = self.cloud.scattering.descriptor.unit if isinstance(self.cloud.scattering, NetworkScattering) else 0.0
-        if corrected and self._looked().thin:
-            # Of it next to all was scattered once or twice and goes on about as the sun's light does, which few directions tell nothing of.
+        if corrected:
+            # Harmonics lack the peaks of what was scattered a few times, a walk for each ray costs no more than their prediction, and the
+            # film smooths its noise.
             self._paths = self._traced()
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper), unit)
             return
@@ -265,23 +280,16 @@ class Frame:
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-20)
             o, d = (vectors_of(types, v) for v in (places, ahead))
             seen = seen_by(self.cloud.field, o, d, self.on_surfaces.shade.reach(o, d), types.Float(0.5), 2)
-            # Light on what the camera sees counts in the image, by the cloud's size as seen from there.
-            counts = np.square(radius / np.maximum(np.linalg.norm(places - 0.5 * (lower + upper), axis=1), radius))
-            counts[len(parts[0][0]) :] = 0
             lights = from_suns(types, self.on_surfaces.suns, self.on_surfaces.shade)
-            walks = self._walked(self.on_surfaces.sources, corrected, seen, ahead[seen.rays])
-            if walks is not None:
-                lights += self._bright(self.on_surfaces.sources)
-            else:
-                for source, _ in self.on_surfaces.sources:
-                    lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
-            how = _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, walks, self.seed, until, self.on_surfaces.shade
-            self.all_round = AllRound(self._roughly, lights, seen, ahead[seen.rays], counts[seen.rays], *how)
+            for source, _ in self.on_surfaces.sources:
+                lights += from_source(types, source, _BEAMS_THROWN, True, self.seed)
+            how = _ROOT_AROUND, _THROWN * tolerance, _BUDGET // 4, until, self.on_surfaces.shade
+            self.all_round = AllRound(self._roughly, lights, seen, *how)
             self.counts.queries += self.all_round.queries
             self.film.thrown = ThrownLight(types, self.scene.size, (lower, upper), unit)
         self.spent("light on surfaces", clock)
 
-    def prepare_thrown_back(self, tolerance: float, corrected: bool = False, until: float = math.inf) -> None:
+    def prepare_thrown_back(self, tolerance: float, until: float = math.inf) -> None:
         """The same for what surfaces send to the cloud, and it back to them: once, in the light that `on_cloud` has of them."""
         first = self.all_round
         if first is None:
@@ -289,14 +297,13 @@ class Frame:
         clock = time.perf_counter()
         lights: list[Arriving] = []
         sources = self.on_cloud.sources[len(self.on_surfaces.sources) :]
-        walks = self._walked(sources, corrected, first.seen, first.along)
-        for source, _ in sources if walks is None else ():
+        for source, _ in sources:
             # Of so few parts, what one point sees in the middle is a poor measure: a shadow there would stand for all.
             lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.
         wide = 2 * _THROWN * tolerance
-        how = _ROOT_AROUND, wide, _BUDGET // 4, walks, self.seed + 1, until, self.on_surfaces.shade
-        first.again = AllRound(self._roughly, lights, first.seen, first.along, first.counts, *how)
+        how = _ROOT_AROUND, wide, _BUDGET // 4, until, self.on_surfaces.shade
+        first.again = AllRound(self._roughly, lights, first.seen, *how)
         self.counts.queries += first.again.queries
         self.spent("light on surfaces", clock)
 
@@ -362,7 +369,7 @@ class Frame:
         }
         if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
             how = seen, _ROOT_AROUND, of_around, walks.most, self.seed
-            around_it = walked_source(self.cloud, self.cloud.scattering, walks, eyes, *how, until=until, finest=finest, shade=shade)
+            around_it = walked_source(self.cloud, self.cloud.scattering, walks, self.camera, *how, until=until, finest=finest, shade=shade)
         else:
             root = wide * _ROOT_AROUND
             how_far = root, of_around, _BUDGET
@@ -404,29 +411,18 @@ class Frame:
         width, height = self.scene.size
         error /= self._weight
         found = Audit(self.cloud, self._of_image, self.sources, self._camera_rays, self._window, self._looked().met, self.seed)
-        most, at_once, of_thrown = _MOST_TIMED, _TIMED_ROUND, _WALKS_THROWN // 4
+        most, at_once = _MOST_TIMED, _TIMED_ROUND
         if math.isinf(until):
             # Walks are as noisy as any path: half of the error takes four times as many.
             usual = min(WALKS_A_PIXEL * width * height, WALKS_A_SIGHT * self._looked().met * self._window.count)
             most = int(np.clip(usual * (ERROR / error) ** 2, FEWEST, MOST))
-            at_once, of_thrown = ROUND, _WALKS_THROWN
+            at_once = ROUND
 
         def more(seconds: float) -> bool:
             return time.perf_counter() + seconds < until and not (interrupted is not None and interrupted())
 
-        thrown = None
-        if correct and self.all_round is not None and more(_LEAST_THROWN):
-            thrown = self.all_round.correct(LightWalks(self.cloud, self.on_cloud), of_thrown, self.seed)
-            wrong = max((max(f, 1 / max(f, 1e-9)) for f in thrown.get("factor", ())), default=1.0)
-            if wrong > _MOST_WRONG:
-                # One number does not mend that.
-                self._paths = self._traced()
-                thrown["traced"] = True
-                _LOG.info("light thrown on surfaces is predicted wrongly by a factor of %.3g: it is path-traced instead", wrong)
         outcome = audited(found, self.sources, correct, error, most, more, at_once)
         self.sources, self.found = outcome.sources, outcome.found
-        if thrown is not None and self.found:
-            self.found = {**self.found, "thrown": thrown}
         self.spent("audit", clock)
 
     def sampling_seconds(self, error: float) -> tuple[float, float]:

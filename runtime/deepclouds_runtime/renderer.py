@@ -342,7 +342,7 @@ class Renderer:
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
                 if turn == 0 or math.isinf(until):
-                    frame.prepare_thrown_back(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
+                    frame.prepare_thrown_back(_INTERPOLATION * error, part_of_time(until, _ON_SURFACES))
             if self.mode == "fast" and not frame.sampled:
                 frame.prepare(_INTERPOLATION * error, corrected=correct, until=until)
         except Stopped:

@@ -219,7 +219,7 @@ def scatter(
     """
     types = cloud.field.types
     channel_count = len(cloud.albedo)
-    if cloud.exact > 1 and cloud.scattering is not None:
+    if cloud.exact > 1 and (cloud.scattering is not None or cloud.known is not None):
         for c, value in enumerate(single_scattering(replace(cloud, scattering=None), lights, points, w, numbers)):
             dr.scatter(result.direct[c], value * opacity, lanes)
         scatter_on(cloud, lights, points, w, opacity, importance, numbers, counts, lanes, result)

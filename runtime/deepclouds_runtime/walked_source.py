@@ -7,8 +7,6 @@ hundred walks from a node cost less, and know J to a few percent, without bias.
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,12 +19,10 @@ from deepclouds_runtime.transport import Cloud
 
 # Noise of a node's J that its walks are for, over the mean, and the fewest and the most of them.
 _NOISE, _FEWEST, _MOST = 0.06, 64, 512
-# For each of several eyes, of whose values mixtures are made.
-_EACH_EYE = 32
 # A trial that tells how many: points, and walks from each.
 _TRIED, _TRIALS = 64, 64
 # Points at which the interpolation is measured.
-_CHECKS, _LEAST_CHECKS = 256, 64
+_CHECKS = 256
 # Walks that are in memory together.
 _AT_ONCE = 1 << 18
 
@@ -35,14 +31,12 @@ def walked_source(
     cloud: Cloud,
     network: NetworkScattering,
     walks: LightWalks,
-    eyes: Sequence[Sees],
+    eye: Sees,
     seen: Seen,
     root: float,
     tolerance: float,
     most: int,
     seed: int,
-    combine: Callable[[Array], Array] = operator.itemgetter(0),
-    every: int = 1,
     until: float = math.inf,
     finest: float = 0.0,
     shade: Shade | None = None,
@@ -51,12 +45,14 @@ def walked_source(
 
     Parameters
     ----------
-    cloud, eyes, seen, root, tolerance, combine, every, until, finest, shade
+    cloud, seen, root, tolerance, until, finest, shade
         see `deepclouds_runtime.frame_source.frame_source`.
     network
         has the unit of length, and knows whether to give up, by `Stopped`; it is not asked.
     walks
         estimate J.
+    eye
+        tells in which direction each point is seen.
     most
         walks at nodes.
     seed
@@ -64,37 +60,27 @@ def walked_source(
     """
     if not any(cloud.albedo) or not len(seen.points) or network.descriptor.empty:
         return None
-    found = _Walked(walks, eyes, len(cloud.albedo), network, combine, seed)
-    if len(eyes) == 1:
-        found.choose(seen)
-    nodes, checks = most // (found.each * len(eyes)), max(_LEAST_CHECKS, _CHECKS // len(eyes))
-    return interpolated(cloud.field, network, found, seen, root, tolerance, nodes, checks, walks.lights, every, until, 1, finest, shade)
+    found = _Walked(walks, eye, len(cloud.albedo), network, seed)
+    found.choose(seen)
+    how = cloud.field, network, found, seen, root, tolerance, most // found.each, _CHECKS, walks.lights
+    return interpolated(*how, until=until, overdrawn=1, finest=finest, shade=shade)
 
 
 class _Walked:
     """What the octree interpolates: J of each colour channel, means of walks."""
 
-    def __init__(
-        self,
-        walks: LightWalks,
-        eyes: Sequence[Sees],
-        channels: int,
-        network: NetworkScattering,
-        combine: Callable[[Array], Array],
-        seed: int,
-    ) -> None:
-        self._walks, self._eyes, self._network, self._combine = walks, eyes, network, combine
+    def __init__(self, walks: LightWalks, eye: Sees, channels: int, network: NetworkScattering, seed: int) -> None:
+        self._walks, self._eye, self._network = walks, eye, network
         self._random = np.random.default_rng([seed & 0xFFFFFFFF, 0x3C1D])
         self.mix: Array = np.eye(channels)
-        # What one eye sees is looked at itself; of several, only mixtures are.
-        self.carried = 2 if network.knows_errors and len(eyes) == 1 else 0
-        self.queries, self.shared, self.model, self.each = 0, 0, "", _TRIALS if len(eyes) == 1 else _EACH_EYE
+        self.carried = 2 if network.knows_errors else 0
+        self.queries, self.shared, self.model, self.each = 0, 0, "", _TRIALS
 
     def choose(self, seen: Seen) -> None:
         """Set how many walks start at a node, from a trial at what the camera sees."""
         total = np.cumsum(seen.weights)
         points = seen.points[np.searchsorted(total, (np.arange(_TRIED) + 0.5) / _TRIED * total[-1])]
-        mean, variance = self._estimated(points, self._eyes[0])
+        mean, variance = self._estimated(points)
         level = float(mean.mean())
         if level > 0:
             needed = float(variance.mean()) * _TRIALS / (_NOISE * level) ** 2
@@ -105,23 +91,23 @@ class _Walked:
 
     def __call__(self, points: Array) -> Array:
         """Fields (n, l) at world points (n, 3); the last `carried` of them are the sum of the others and its standard deviation."""
-        found = [self._estimated(points, eye) for eye in self._eyes]
-        fields = self._combine(np.stack([mean for mean, _ in found]).astype(np.float32))
+        mean, variance = self._estimated(points)
+        fields = mean.astype(np.float32)
         if not self.carried:
             return fields
         # Channels of one walk err together.
-        error = np.sqrt(found[0][1]).sum(axis=1)
+        error = np.sqrt(variance).sum(axis=1)
         return np.concatenate([fields, fields.sum(axis=1, keepdims=True), error[:, None].astype(np.float32)], axis=1)
 
-    def _estimated(self, points: Array, eye: Sees) -> tuple[Array, Array]:
-        """Means of J (n, channels) as an eye sees it, and their variances."""
+    def _estimated(self, points: Array) -> tuple[Array, Array]:
+        """Means of J (n, channels) as the eye sees it, and their variances."""
         n, each, channels = len(points), self.each, len(self.mix)
         mean, variance = np.zeros((n, channels)), np.zeros((n, channels))
         for start in range(0, n, max(1, _AT_ONCE // each)):
             if self._network.stop is not None and self._network.stop():
                 raise Stopped
             part = points[start : start + max(1, _AT_ONCE // each)]
-            j = self._walks(np.repeat(part, each, axis=0), np.repeat(eye.toward(part), each, axis=0), self._random)
+            j = self._walks(np.repeat(part, each, axis=0), np.repeat(self._eye.toward(part), each, axis=0), self._random)
             j = j.reshape(len(part), each, channels)
             mean[start : start + len(part)] = j.mean(axis=1)
             variance[start : start + len(part)] = j.var(axis=1) / (each - 1)

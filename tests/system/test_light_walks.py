@@ -194,7 +194,7 @@ def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
     points = np.random.default_rng(57).uniform(-0.8, 0.8, (3000, 3))
     seen = Seen(points, np.ones(len(points)), np.arange(len(points)))
     walks = LightWalks(cloud, lights, smooth=True)
-    source = walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
+    source = walked_source(cloud, network, walks, Along(), seen, 2.0, 0.05, 1 << 19, 58)
     assert source is not None
     assert source.queries == 0
     assert source.statistics.nodes > 50
@@ -213,18 +213,18 @@ def test_a_sky_is_walked_at_nodes_and_interpolated(types: Any) -> None:
         assert off < np.hypot(1.3 * source.error, noise)
         assert off < 0.12
         assert j[:, c].mean() == pytest.approx(mean[:, c].mean(), rel=0.01)
-    again = walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
+    again = walked_source(cloud, network, walks, Along(), seen, 2.0, 0.05, 1 << 19, 58)
     assert again is not None
     assert again.statistics == source.statistics
     # Where the time is over before it began, the fewest nodes.
-    late = walked_source(cloud, network, walks, [Along()], seen, 0.2, 0.05, 1 << 19, 58, until=0.0)
+    late = walked_source(cloud, network, walks, Along(), seen, 0.2, 0.05, 1 << 19, 58, until=0.0)
     assert late is not None
     assert late.statistics.nodes <= 64
     assert late.statistics.cells == []
     network.stop = lambda: True
     with pytest.raises(Stopped):
-        walked_source(cloud, network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
-    black = walked_source(Cloud(cloud.field, (0.0, 0.0, 0.0), PHASE, None), network, walks, [Along()], seen, 2.0, 0.05, 1 << 19, 58)
+        walked_source(cloud, network, walks, Along(), seen, 2.0, 0.05, 1 << 19, 58)
+    black = walked_source(Cloud(cloud.field, (0.0, 0.0, 0.0), PHASE, None), network, walks, Along(), seen, 2.0, 0.05, 1 << 19, 58)
     assert black is None
 
 
