@@ -79,9 +79,9 @@ def rendered(
     interpolated = orders == 1 and how.get("mode") != "reference"
     truth = WalkScattering(renderer._field, 512 if interpolated else 1, 1000 + seed)
 
-    def asked(self: NetworkScattering, points: Any, w: Any, omega: Any, phase: Any, albedos: Any, tau: Any, errors: Any) -> Any:
-        j = truth(points, w, omega, phase, albedos, tau)
-        return (j * factor).astype(np.float32), None
+    def asked(self: NetworkScattering, query: Any, **how: Any) -> Any:
+        j = truth(query.points, query.w, query.omega_sun, query.phase, query.albedos, query.tau)
+        return (j * factor).astype(np.float32), None, None
 
     monkeypatch.setattr(NetworkScattering, "_asked", asked)
     return renderer.render(spp, seed, **error)
