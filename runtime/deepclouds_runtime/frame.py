@@ -44,7 +44,7 @@ from deepclouds_runtime.result import Image
 from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.surfaces import diffuse_share, reflected, reflected_from_cloud
+from deepclouds_runtime.surfaces import diffuse_share, reflected, reflected_from_cloud, reflected_from_surfaces
 from deepclouds_runtime.thrown import ThrownLight
 from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
 from deepclouds_runtime.walked_source import walked_source
@@ -79,6 +79,8 @@ _TRIED, _NEGLIGIBLE, _LARGE, _MOST_SPARED = 4096, 0.04, 0.5, 4.0
 _CORRECTED, _THROWN = 1.6, 4.0
 # Rays from a sample of a surface that look for this light, where they are short: it is noisier than all else in a sample.
 _RAYS_THROWN = 2
+# Which of a sample's unrelated numbers draw the ray from surface to surface.
+_BETWEEN = 9
 # Orders of scattering of that light that are sampled at most, and what may be left of a peak in what is scattered more often.
 _MOST_EXACT, _PEAK = 3, 0.15
 # Collisions of a camera ray that get shadow rays; under suns alone, where these are all that they cost, more: along a ray noise falls with
@@ -201,6 +203,11 @@ class Frame:
         return next((n for n in range(1, _MOST_EXACT) if g ** ((ORDER + 1) * (n + 1)) < _PEAK), _MOST_EXACT)
 
     @property
+    def _sent(self) -> tuple[tuple[LightSource, int], ...]:
+        """What surfaces send, once that is known."""
+        return self.on_cloud.sources[len(self.on_surfaces.sources) :]
+
+    @property
     def _of_image(self) -> Lights:
         """The lights, with what of them is interpolated in this camera's image."""
         return replace(self.on_cloud, smooth=self._smooth)
@@ -296,7 +303,7 @@ class Frame:
             return
         clock = time.perf_counter()
         lights: list[Arriving] = []
-        sources = self.on_cloud.sources[len(self.on_surfaces.sources) :]
+        sources = self._sent
         for source, _ in sources:
             # Of so few parts, what one point sees in the middle is a poor measure: a shadow there would stand for all.
             lights += from_beams(self.types, source, _BEAMS_BACK)
@@ -344,7 +351,7 @@ class Frame:
         around: list[Arriving] = []
         wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
         # Surfaces inside of the cloud light it from near by, and each sample would find that anew.
-        sent = self.on_cloud.sources[len(self.on_surfaces.sources) :] if self.on_cloud.shade.inside else ()
+        sent = self._sent if self.on_cloud.shade.inside else ()
         smooth = tuple(source for source, _ in sent)
         walks = self._walked(self.on_cloud.sources, corrected, seen, self.camera.toward(seen.points), smooth)
         for source, _ in self.on_cloud.sources:
@@ -544,6 +551,9 @@ class Frame:
         if interaction is not None:
             colours = reflected(self.cloud, self.on_surfaces, interaction, numbers)
             if self.interreflection:
+                for source, _ in self._sent:
+                    more = reflected_from_surfaces(self.cloud, self.on_cloud, source, interaction, numbers.unrelated(_BETWEEN))
+                    colours = [a + b for a, b in zip(colours, more, strict=True)]
                 weight = dr.select(shown, through, 0)
                 thrown = self._thrown(interaction, weight, numbers)
                 if self.film.thrown is not None:

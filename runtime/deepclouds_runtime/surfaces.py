@@ -16,7 +16,7 @@ from deepclouds_runtime.disc import Disc, discs
 from deepclouds_runtime.lights import LightSource
 from deepclouds_runtime.scene_lights import Sun
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light
+from deepclouds_runtime.transport import Cloud, Counts, Lights, cloud_light, taker
 
 # Of the rays that look for light of the cloud, those toward suns at most; the peak of a phase function that gets half of them; and what
 # is not worth the while.
@@ -37,7 +37,7 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
 
     Notes
     -----
-    Light between surfaces is not part of it.
+    Light between surfaces is not part of it: see `reflected_from_surfaces`.
     """
     mi, types = mitsuba(), cloud.field.types
     context = mi.BSDFContext()
@@ -85,6 +85,49 @@ def reflected(cloud: Cloud, lights: Lights, interaction: Any, numbers: Stratifie
         for c, (value, light) in enumerate(zip(channels(types, weight), source.arriving(origin, omega, numbers), strict=True)):
             total[c] += value * light * share
     return [dr.select(plain(types, valid), value, 0) for value in total]
+
+
+def reflected_from_surfaces(cloud: Cloud, lights: Lights, source: LightSource, interaction: Any, numbers: Stratified) -> list[Any]:
+    """Radiance that surfaces send back of what other surfaces send them: one ray by the BSDF a lane; one array a colour channel.
+
+    Parameters
+    ----------
+    cloud, lights
+        what dims the light on its way, and where surfaces are.
+    source
+        what surfaces send, see `deepclouds_runtime.reflectors.Reflectors`.
+    interaction
+        Mitsuba's surface interactions, one a lane; invalid ones give 0.
+    numbers
+        random numbers of the lanes.
+
+    Notes
+    -----
+    What the other surfaces send in their turn of each other's light is left out.
+    """
+    mi, types = mitsuba(), cloud.field.types
+    valid = interaction.is_valid()
+    sample, weight = interaction.bsdf().sample(
+        mi.BSDFContext(),
+        interaction,
+        mi.Float(numbers.number(stratified.SURFACE_W)),
+        mi.Point2f(numbers.number(stratified.SURFACE_U), numbers.number(stratified.SURFACE_V)),
+        valid,
+    )
+    omega = plain(types, interaction.to_world(sample.wo))
+    origin = plain(types, interaction.spawn_ray(mi.Vector3f(omega)).o)
+    throughput = channels(types, weight)
+    end = lights.shade.reach(origin, omega, valid)
+    total = [dr.zeros(types.Float, dr.width(interaction.p)) for _ in cloud.albedo]
+    dr.eval(origin, omega, throughput, end)
+    lanes: Any = dr.compress(end < math.inf)
+    if len(lanes):
+        take = taker(types, lanes)
+        origin, omega, end = take(origin), take(omega), take(end)
+        share = dr.exp(-optical_depth(cloud.field, origin, omega, types.Float(0), end, types.Bool(True)))
+        for c, light in enumerate(source.arriving(origin, omega, numbers.take(lanes))):
+            dr.scatter(total[c], take(throughput[c]) * light * share, lanes)
+    return total
 
 
 def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight: Any, numbers: Stratified, counts: Counts) -> list[Any]:
