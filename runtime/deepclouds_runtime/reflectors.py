@@ -14,7 +14,7 @@ from deepclouds.backend import lanes_of, vectors_of
 from deepclouds_runtime._mitsuba import mitsuba, plain
 from deepclouds_runtime.lights import Beam, Environment, directions_of_cells, on_host
 from deepclouds_runtime.stratified import Stratified
-from deepclouds_runtime.surfaces import reflected, reflected_from_cloud
+from deepclouds_runtime.surfaces import reflected, reflected_from_cloud, reflected_from_surfaces
 from deepclouds_runtime.transport import Cloud, Counts, Lights
 
 _PROBE_ROWS = 32
@@ -25,6 +25,8 @@ _PROBE_PATHS, _PROBE_PARTS = 64, 4
 _CELLS, _BEYOND, _RAYS, _TRIED, _PRIOR = 32, 0.05, 1 << 16, 4, 4.0
 # A sample beside the middle sees lit surfaces where the middle sees the cloud's own shadow: many directions ignore the table.
 _PROBE_UNIFORM = 0.5
+# Which of a ray's unrelated numbers draw the next one, to another surface.
+_ONWARD = 11
 
 
 def _outward(types: Any, interaction: Any, direction: Any) -> Any:
@@ -111,10 +113,12 @@ class Reflectors:
         32 bits, of the table's random numbers.
     counts
         is updated.
+    before
+        what the surfaces send each other, where that is known: they send it on.
     """
 
-    def __init__(self, cloud: Cloud, lights: Lights, on_cloud: Lights, seed: int, counts: Counts) -> None:
-        self._cloud, self._lights, self._types = cloud, lights, cloud.field.types
+    def __init__(self, cloud: Cloud, lights: Lights, on_cloud: Lights, seed: int, counts: Counts, before: Reflectors | None = None) -> None:
+        self._cloud, self._lights, self._types, self._before = cloud, lights, cloud.field.types, before
         lower, upper = cloud.field.volume.bounds
         self._middle = self._types.Array3f(*(dr.opaque(self._types.Float, float(v)) for v in 0.5 * (lower + upper)))
         self._near = _Inside(cloud, lights, on_cloud, seed, counts) if lights.shade.inside else None
@@ -128,6 +132,9 @@ class Reflectors:
         interaction = self._seen(points, direction)
         shown = plain(self._types, interaction.is_valid())
         direct = reflected(self._cloud, self._lights, interaction, numbers.unrelated())
+        if self._before is not None:
+            onward = reflected_from_surfaces(self._cloud, self._lights, self._before, interaction, numbers.unrelated(_ONWARD))
+            direct = [a + b for a, b in zip(direct, onward, strict=True)]
         # What the middle sees where the point's ray ends; it may be something before that.
         place = plain(self._types, interaction.p)
         there = place - self._middle

@@ -332,13 +332,14 @@ class Renderer:
                 network.stop = interrupted
             if adaptive and self._interreflection:
                 frame.prepare_thrown(_INTERPOLATION * error, correct, part_of_time(until, _ON_SURFACES))
+            reflectors: Reflectors | None = None
             for turn in range(_TURNS if self._interreflection else 0):
                 clock = time.perf_counter()
                 seed = (frame.seed + turn) & 0xFFFFFFFF
                 probed = frame.probed(correct and math.isinf(until))
                 # Walks in the place of queries are none.
                 counts = frame.counts if probed.paths is frame.cloud.paths else Counts()
-                reflectors = Reflectors(probed, lights, frame.on_cloud, seed, counts)
+                reflectors = Reflectors(probed, lights, frame.on_cloud, seed, counts, reflectors)
                 frame.on_cloud = replace(lights, sources=(*lights.sources, (reflectors, 1)))
                 frame.spent("probe", clock)
                 if turn == 0 or math.isinf(until):

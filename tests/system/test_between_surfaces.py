@@ -1,6 +1,6 @@
 """Rationale: surfaces light each other: the side of a ball that looks down sees the floor, a corner sees both of its walls.
 
-Expected behaviour: that light is there once, as Mitsuba's `volpath` has it with two bounces, also past a cloud that dims it.
+Expected behaviour: that light is there, as Mitsuba's `volpath` has it with three bounces, also past a cloud that dims it.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def _tiles(image: Any) -> Tiles:
 
 
 def _true(mi: ModuleType, path: Path, samples: int) -> Tiles:
-    """Paths that end at the second surface, or collision."""
-    return _tiles(mi.render(mi.load_file(str(path), depth=3), spp=samples, seed=1))
+    """Paths that end at the third surface, or collision."""
+    return _tiles(mi.render(mi.load_file(str(path), depth=4), spp=samples, seed=1))
 
 
 @pytest.mark.parametrize("light", [SUN, SKY])
-def test_two_bounces_are_those_of_mitsuba(tmp_path: Path, llvm_mitsuba: ModuleType, light: str) -> None:
+def test_three_bounces_are_those_of_mitsuba(tmp_path: Path, llvm_mitsuba: ModuleType, light: str) -> None:
     path = _scene(tmp_path, light)
     true = _true(llvm_mitsuba, path, 1024)
     np.testing.assert_allclose(_tiles(load(path, predictor=Smooth()).render(256, 2).rgb), true, rtol=0.02)
