@@ -88,7 +88,7 @@ _MOST_EXACT, _PEAK = 3, 0.15
 _DEPTHS, _DEPTHS_SUNS = 4, 8
 # Most walks where the time decides, and by how much longer than a trial says samples take: rounds end before the time does.
 _MOST_TIMED, _SLOWER = 1 << 26, 1.3
-# There walks come in smaller rounds, and there are none unless there are so many seconds for them; those for thrown light need more.
+# There walks come in smaller rounds, and there are none unless there are so many seconds for them.
 _TIMED_ROUND, _LEAST_AUDIT = 1 << 15, 0.25
 # Of more pixels than these a trial takes one in sixteen, else one in four.
 _MANY_PIXELS = 1 << 16
@@ -187,9 +187,9 @@ class Frame:
         """The cloud as surfaces see it."""
         if self._paths is not None:
             return replace(self.cloud, scattering=None, paths=self._paths, exact=1)
-        return (
-            self.cloud if self.all_round is None else replace(self.cloud, scattering=None, known=self.all_round, exact=self._exact_thrown)
-        )
+        if self.all_round is None:
+            return self.cloud
+        return replace(self.cloud, scattering=None, known=self.all_round, exact=self._exact_thrown)
 
     @functools.cached_property
     def _exact_thrown(self) -> int:
@@ -250,8 +250,10 @@ class Frame:
 
         Parameters
         ----------
-        tolerance, corrected, until
+        tolerance, until
             see `prepare`.
+        corrected
+            walks correct the image: this light is path-traced.
         """
         types = self.types
         lower, upper = self.cloud.field.volume.bounds

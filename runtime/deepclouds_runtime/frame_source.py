@@ -367,7 +367,8 @@ def interpolated(
         if corners <= most or lattice.size.max() <= 2:
             break
         spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
-    evaluate.on_lattice(lattice, levels)
+    # Nothing is split where the corners take all there is.
+    evaluate.on_lattice(lattice, levels if root_nodes(lattice, seen.points, 0) < nodes else 0)
     place = _BeforeSurfaces(field.types, shade) if shade is not None and shade.surfaces is not None else None
     how = tolerance, nodes, levels, evaluate.carried, paced.affordable, place
     octree = Octree(lattice, paced, built_for.points, built_for.weights, *how)
