@@ -56,8 +56,8 @@ class AllRound:
 
     Attributes
     ----------
-    sources
-        harmonics of J at the nodes; none where it is 0 everywhere.
+    source
+        harmonics of J at the nodes; None where it is 0 everywhere.
     queries
         asked of the network.
     seen
@@ -78,10 +78,9 @@ class AllRound:
         shade: Shade | None = None,
     ) -> None:
         eyes = [Direction(w) for w in spread(DIRECTIONS)]
-        source = frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, until, shade=shade)
-        self.sources = [] if source is None else [source]
+        self.source = frame_source(cloud, lights, eyes, seen, root, tolerance, budget, fit, _HARMONICS, until, shade=shade)
         self._channels, self._types = len(cloud.albedo), cloud.field.types
-        self.queries = sum(source.queries for source in self.sources)
+        self.queries = 0 if self.source is None else self.source.queries
         self.seen = seen
         self.again: AllRound | None = None
 
@@ -93,17 +92,15 @@ class AllRound:
         return total
 
     def _own(self, points: Any, w: Any) -> list[Any]:
-        total = [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
-        basis = harmonics(w.x, w.y, w.z)
-        for source in self.sources:
-            octree = source.octree
-            values = octree.lookup(octree.to_local(points), self._types.Bool(True))
-            sums = []
-            for f in range(len(values) // _HARMONICS):
-                terms = [b * v for b, v in zip(basis, values[f * _HARMONICS : (f + 1) * _HARMONICS], strict=True)]
-                sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
-            total = [a + b for a, b in zip(total, source.colours(sums), strict=True)]
-        return total
+        if self.source is None:
+            return [dr.zeros(self._types.Float, dr.width(points)) for _ in range(self._channels)]
+        octree, basis = self.source.octree, harmonics(w.x, w.y, w.z)
+        values = octree.lookup(octree.to_local(points), self._types.Bool(True))
+        sums = []
+        for f in range(len(values) // _HARMONICS):
+            terms = [b * v for b, v in zip(basis, values[f * _HARMONICS : (f + 1) * _HARMONICS], strict=True)]
+            sums.append(dr.maximum(sum(terms[1:], terms[0]), 0))
+        return self.source.colours(sums)
 
 
 def spread(count: int) -> Array:

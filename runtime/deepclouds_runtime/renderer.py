@@ -373,9 +373,8 @@ class Renderer:
             noise if noise is not None and math.isfinite(noise) else None,
             complete,
         )
-        thrown = () if frame.all_round is None else tuple(frame.all_round.sources)
-        for name, source in (*frame.named.items(), *((_thrown(k), source) for k, source in enumerate(thrown))):
-            statistics.sources[name] = source.summary()
+        named = {**frame.named, "light on surfaces": None if frame.all_round is None else frame.all_round.source}
+        statistics.sources |= {name: source.summary() for name, source in named.items() if source is not None}
         statistics.skipped = frame.skipped()
         statistics.audit = frame.found
         levels = 0 if self._network is None else self._network.descriptor.nbytes
@@ -408,10 +407,6 @@ class Renderer:
         if self.scene.environment is not None:
             sources.append((environment(self._types, self.scene.environment, shade), self.environment_directions))
         return Lights(self.scene.suns, tuple(sources), shade)
-
-
-def _thrown(number: int) -> str:
-    return "light on surfaces" if number == 0 else f"light on surfaces, {number + 1}"
 
 
 def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene) -> list[str]:
