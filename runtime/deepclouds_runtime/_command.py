@@ -128,7 +128,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("--hide-emitters", action="store_true", default=None, help="black behind the cloud in place of the sky")
     parser.add_argument("--env-directions", type=_positive, help="directions drawn from an environment at each sample (default 2)")
-    parser.add_argument("--no-interreflection", action="store_true", help="leave out the light that surfaces and cloud throw on each other")
+    parser.add_argument(
+        "--no-interreflection", action="store_true", help="leave out the light that surfaces and cloud, and surfaces, throw on each other"
+    )
     parser.add_argument("--png", metavar="FILE", nargs="?", const="", help="also write a tone-mapped preview (default name: OUT.png)")
     parser.add_argument("--exposure", type=float, default=0.0, help="of the preview, in stops (default %(default)s)")
     parser.add_argument("--variant", metavar="NAME", help="Mitsuba's variant, such as cuda_ad_rgb (default llvm_ad_rgb)")

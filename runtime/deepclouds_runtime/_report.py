@@ -38,6 +38,7 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
     rows += list(_audit_rows(statistics.audit))
     for name, source in statistics.sources.items():
         took = f"{source['nodes']:,} nodes, {source['queries']:,} queries{_of(source['model'])}"
+        took += f" ({source['shared']:,} of them in part)" if source["shared"] else ""
         took += f", error at a point {100 * source['error']:.2g} %"
         rows.append((f"{name} ({source['lights']})", f"{took}, cells refined {' + '.join(map(str, source['refined'])) or 0}"))
     counts = {name.replace("_", " "): count for name, count in asdict(result.counts).items() if name != "skipped"}
