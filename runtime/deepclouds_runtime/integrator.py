@@ -7,7 +7,7 @@
 | hide_emitters | boolean | black behind the cloud in place of the environment (default false) |
 | model | string | path of a network, or the name of a released one (default: the one that comes with the package) |
 | environment_directions | integer | directions drawn from an environment at each sample of the cloud (default 2) |
-| interreflection | boolean | light that surfaces and cloud throw on each other, one reflection each (default true) |
+| interreflection | boolean | light that surfaces and cloud, and surfaces, throw on each other (default true) |
 | mode | string | `fast` (default), or `reference`: every sample asks the network |
 | error | float | of the fast mode without a number of samples: noise of a pixel to aim at over the mean (default 0.02) |
 | exact_orders | integer | orders of scattering that are sampled before the network is asked (default 1) |
