@@ -33,9 +33,10 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
     statistics = result.statistics
     rows = [("mode", statistics.mode), ("samples a pixel", f"up to {statistics.spp:,}, on average {statistics.mean_spp:.3g}")]
     rows += zip(("error: samples and interpolation", "error: network"), in_words(statistics.error), strict=True)
+    what = "multiple scattering" if statistics.error.get("network", {}).get("by") == "none" else "the network"
     if statistics.network:
         rows.append(("error of the network, expected", f"{100 * statistics.network['error']:.2g} % of the cloud's light"))
-    rows += list(_audit_rows(statistics.audit))
+    rows += list(_audit_rows(statistics.audit, what))
     for name, source in statistics.sources.items():
         took = f"{source['nodes']:,} nodes, {source['queries']:,} queries{_of(source['model'])}"
         took += f" ({source['shared']:,} of them in part)" if source["shared"] else ""
@@ -53,11 +54,11 @@ def report(result: RenderResult, say: Callable[[str], None]) -> None:
         say(f"{name.ljust(width)}  {value}")
 
 
-def _audit_rows(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """What the audit found, in lines."""
+def _audit_rows(found: dict[str, Any], what: str) -> Iterator[tuple[str, str]]:
+    """What the audit found, in lines; `what` was audited."""
     if not found:
         return
-    yield "error of the network, measured", _measured(found["network"])
+    yield f"error of {what}, measured", _measured(found["network"])
     if found["corrected"]:
         yield "error once corrected, measured", _measured(found["remaining"])
     yield "walks that measured it", f"{found['walks']:,}" + ("" if found["corrected"] else ", no correction made")

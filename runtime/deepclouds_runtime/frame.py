@@ -67,6 +67,8 @@ _BEAMS, _BRIGHT = 48, 0.1
 _BEAMS_THROWN, _BEAMS_BACK = 12, 4
 # Most collisions of all walks at nodes; of how many on the mean walks are still cheaper than queries, by so many that are tried.
 _COLLISIONS_AROUND, _MOST_COLLISIONS, _COUNTED = 1 << 26, 1000.0, 1024
+# A quick look has so many times fewer.
+_QUICK = 16
 # Edge of the coarsest cells in units of length (mean free paths), for the suns and for light from all around, under which J is smoother.
 _ROOT, _ROOT_AROUND = 2.0, 4.0
 # Edge of the finest cells in pixels, as large as these look at the nearest of what the camera sees, a quantile.
@@ -113,6 +115,8 @@ class Frame:
     quick
         a quicker network than the cloud's, asked about light from all around and about what surfaces see, which walks correct later; None
         asks the cloud's.
+    unknown
+        whether the network was not trained on the medium: walks at nodes take its place.
     sampled
         whether multiple scattering is sampled at one of these collisions, past the orders that are exact, in place of interpolated.
     counts, seconds
@@ -139,6 +143,7 @@ class Frame:
     interreflection: bool
     depths: int | None = None
     quick: NetworkScattering | None = None
+    unknown: bool = False
     sampled: bool = False
     counts: Counts = field(default_factory=Counts)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -235,10 +240,14 @@ class Frame:
         if not corrected or not sources or not isinstance(network, NetworkScattering) or network.descriptor.empty or not len(seen.points):
             return None
         walks = LightWalks(self.cloud, Lights((), tuple(sources), self.on_cloud.shade, smooth), smooth=True)
-        some = np.linspace(0, len(seen.points) - 1, _COUNTED).astype(np.int64)
-        collisions = walks.collisions(seen.points[some], along[some], np.random.default_rng([self.seed & 0xFFFFFFFF, 0xC011]))
+        collisions = self._collisions(walks, seen, along)
         walks.most = int(min(walks.most, _COLLISIONS_AROUND / max(collisions, 1.0)))
         return walks if collisions <= _MOST_COLLISIONS else None
+
+    def _collisions(self, walks: LightWalks, seen: Seen, along: NDArray[np.float64]) -> float:
+        """How often walks from what is `seen` collide on the mean, by a few that are tried."""
+        some = np.linspace(0, len(seen.points) - 1, _COUNTED).astype(np.int64)
+        return walks.collisions(seen.points[some], along[some], np.random.default_rng([self.seed & 0xFFFFFFFF, 0xC011]))
 
     def _bright(self, sources: Sequence[tuple[LightSource, int]]) -> list[Arriving]:
         """What is bright of environments, as suns."""
@@ -349,6 +358,35 @@ class Frame:
             self._weight = min(max(share / _LARGE, 1 / _MOST_SPARED), 1.0)
             tolerance /= self._weight
         clock = time.perf_counter()
+        finest = _FINEST * float(np.quantile(self.camera.footprint(seen.points), _NEAR)) if len(seen.points) else 0.0
+        how = seen, tolerance, finest, until
+        found = self._walked_sources(*how, quick) if self.unknown else self._predicted_sources(*how, quick, corrected)
+        self.named = {name: source for name, source in found.items() if source is not None}
+        self.sources = list(self.named.values())
+        if not self.unknown:
+            self.errors = relative_errors(self.sources, seen, looked.columns, looked.rows, self.scene.size)
+        self.counts.queries += sum(source.queries for source in self.sources)
+        self.spent("prediction", clock)
+
+    def _walked_sources(self, seen: Seen, tolerance: float, finest: float, until: float, quick: bool) -> dict[str, FrameSource | None]:
+        """J of all lights by walks at nodes, and no network."""
+        network = self.cloud.scattering
+        if not isinstance(network, NetworkScattering) or network.descriptor.empty or not len(seen.points):
+            return {}
+        walks = LightWalks(self.cloud, self.on_cloud)
+        collisions = self._collisions(walks, seen, self.camera.toward(seen.points))
+        most = int(min(walks.most, _COLLISIONS_AROUND / max(collisions, 1.0))) // (_QUICK if quick else 1)
+        how = seen, _ROOT, tolerance, most, self.seed
+        return {
+            "all lights": walked_source(
+                self.cloud, network, walks, self.camera, *how, until=until, finest=finest, shade=self.on_cloud.shade
+            )
+        }
+
+    def _predicted_sources(
+        self, seen: Seen, tolerance: float, finest: float, until: float, quick: bool, corrected: bool
+    ) -> dict[str, FrameSource | None]:
+        """J of suns by the network, and of light from all around by it or by walks."""
         suns = from_suns(self.types, self.on_cloud.suns, self.on_cloud.shade)
         around: list[Arriving] = []
         wide, beams = (2, _BEAMS_THROWN) if quick else (1, _BEAMS)
@@ -371,9 +409,8 @@ class Frame:
         of_suns, of_around = (tolerance / math.sqrt(max(part / max(sum(parts), 1e-30), 1e-6)) for part in parts)
         of_suns *= _CORRECTED if corrected else 1.0
         eyes, first = [self.camera], part_of_time(until, 0.5) if around or walks is not None else until
-        finest = _FINEST * float(np.quantile(self.camera.footprint(seen.points), _NEAR)) if len(seen.points) else 0.0
         shade = self.on_cloud.shade
-        found = {
+        found: dict[str, FrameSource | None] = {
             "suns": frame_source(self.cloud, suns, eyes, seen, wide * _ROOT, of_suns, _BUDGET, until=first, finest=finest, shade=shade),
         }
         if walks is not None and isinstance(self.cloud.scattering, NetworkScattering):
@@ -386,11 +423,7 @@ class Frame:
         found["light from all around"] = around_it
         if walks is not None and around_it is not None:
             self._smooth = smooth
-        self.named = {name: source for name, source in found.items() if source is not None}
-        self.sources = list(self.named.values())
-        self.errors = relative_errors(self.sources, seen, looked.columns, looked.rows, self.scene.size)
-        self.counts.queries += sum(source.queries for source in self.sources)
-        self.spent("prediction", clock)
+        return found
 
     def _share(self, looked: pilot.Pilot) -> float:
         """Share of multiple scattering in the light of the image, by walks from what the camera sees, and a few samples."""

@@ -138,6 +138,8 @@ class Renderer:
         self._field = Field(self._types, scene.volume, scene.scale)
         self._albedo = None if scene.varying is None else AlbedoField(self._field, scene.varying)
         self._network: NetworkScattering | None = None
+        # Whether it was not trained on the scene's medium, and so is not asked.
+        self._unknown = False
         # Whether paths are traced in place of the network, asked for or not; where the albedo varies, in images that walks do not correct.
         self._walks = (unbiased or (self._albedo is not None and predictor is None)) and scene.max_depth != 2
         if scene.max_depth != 2 and not self._walks:
@@ -155,20 +157,24 @@ class Renderer:
                 "walks correct that; in an image that is not corrected multiple scattering is path-traced, noisy and slow",
             )
         if self._network is not None and (unknown := _unknown(self._network, predictor, scene)):
-            instead = "extrapolated" if extrapolate else "path-traced in place of it, noisy and slow ('extrapolate' asks it all the same)"
+            self._unknown = not extrapolate
+            instead = (
+                "extrapolated"
+                if extrapolate
+                else "path-traced in place of it ('extrapolate' asks it all the same): at nodes in an image that walks correct, else for "
+                "each sample, noisy and slow"
+            )
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
-            if not extrapolate:
-                self._network, self._walks = None, True
         self._quick = quick
         self.model_hash: str | None = None
-        if self._network is not None:
+        if self._network is not None and not self._unknown:
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
         self._load_seconds = load_seconds + time.perf_counter() - started
 
     @cached_property
     def _quicker(self) -> NetworkScattering | None:
         """The quicker network, where there is one that was trained on the scene's medium."""
-        if self._quick is None or self._network is None:
+        if self._quick is None or self._network is None or self._unknown:
             return None
         predictor = self._quick()
         return None if _unknown(self._network, predictor, self.scene) else self._network.asking(predictor)
@@ -176,7 +182,7 @@ class Renderer:
     @property
     def unit(self) -> float | None:
         """Unit of length of the network's input, world units; None where no network is asked."""
-        return None if self._network is None else self._network.descriptor.unit
+        return None if self._network is None or self._unknown else self._network.descriptor.unit
 
     def samples(self, spp: int | None) -> int:
         """Samples a pixel of a render that is asked for `spp`; for None those of the camera's sampler."""
@@ -262,7 +268,7 @@ class Renderer:
         gc.collect()
         watch = Watch(progress, partial, interrupted, estimate)
         adaptive = self.mode == "fast"
-        walks = self._walks or (self._albedo is not None and not correct and scene.max_depth != 2)
+        walks = self._walks or ((self._albedo is not None or self._unknown) and not correct and scene.max_depth != 2)
         paths = Paths(self._field, scene.albedo, scene.phase, self._albedo, seed) if walks else None
         scattering = None if walks else self._network
         # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
@@ -275,6 +281,7 @@ class Renderer:
         camera = Camera(types, scene.sensor)
         quick = self._quicker if correct else None
         frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, sampled=sampled)
+        frame.unknown = self._unknown
         frame.spent("lights", started)
         if adaptive and not walks and partial is not None:
             clock = time.perf_counter()
@@ -357,6 +364,7 @@ class Renderer:
         """What a quick look is rendered with: one collision a sample, few nodes, surfaces without the cloud's light."""
         cloud = replace(frame.cloud, exact=1)
         look = Frame(self.scene, frame.camera, cloud, lights, lights, self._types, frame.seed, False, depths=1, quick=frame.quick)
+        look.unknown = frame.unknown
         look.prepare(math.inf, quick=True)
         return look
 
@@ -393,7 +401,7 @@ class Renderer:
             statistics.noise,
             [(source.error, source.level) for source in frame.sources or []],
             indirect / whole if whole > 0 else 0.0,
-            self._network is not None and frame.sources != [],
+            self._network is not None and not self._unknown and frame.sources != [],
             frame.found,
             statistics.network,
             getattr(getattr(self.predictor, "metadata", None), "metrics", {}),

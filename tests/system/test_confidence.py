@@ -167,6 +167,25 @@ def test_media_outside_of_the_training_are_path_traced(cloud: Path) -> None:
     assert size == pytest.approx(optical_size(read_vol(cloud), scene.scale), rel=1e-5)
 
 
+def test_media_outside_of_the_training_are_walked_at_nodes_where_walks_correct(cloud: Path) -> None:
+    options = {**SUN, "g": -0.5, "sky": (0.2, 0.3, 0.4), "albedo": (1.0, 0.9, 0.5)}
+    unknown = Doubting(0.1, 0.1, unknown=("g1 = -0.5 (trained on 0 to 0.9)",))
+    found = load(cloud, predictor=unknown, **options).render(64, seed=3, correct=True)
+    paths = load(cloud, unbiased=True, **options).render(512, seed=4)
+    assert found.statistics.mode == "fast"
+    assert {name: source["queries"] for name, source in found.statistics.sources.items()} == {"all lights": 0}
+    assert found.statistics.error["network"] == {"by": "none"}
+    assert found.counts.queries == 0
+    assert "confidence" not in found.channels
+    tiles = [image.rgb.astype(np.float64).reshape(6, 4, 8, 4, 3).mean(axis=(1, 3)) for image in (found, paths)]
+    assert np.sqrt(np.mean((tiles[0] - tiles[1]) ** 2)) < 0.03 * tiles[1].mean()
+    np.testing.assert_allclose(found.rgb.sum(axis=(0, 1)), paths.rgb.sum(axis=(0, 1)), rtol=0.01)
+    # A first look asks nothing either.
+    first: list[RenderResult] = []
+    load(cloud, predictor=unknown, **options).render(8, seed=3, correct=True, partial=first.append)
+    assert first[0].counts.queries == 0
+
+
 def test_extrapolating_takes_a_word(cloud: Path) -> None:
     found = rendered(cloud, Doubting(0.1, 0.1, unknown=("something",)), extrapolate=True)
     assert found.statistics.mode == "fast"
