@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds_runtime.octree import CORNERS, Array, Lattice, trilinear
+from deepclouds_runtime.octree import CORNERS, Array, Lattice, keys_of, trilinear
 from deepclouds_runtime.scattering import Coarse
 
 # Points so close to a corner, in edges of a cell, are that corner.
 _SAME = 1e-6
-# Corners of a lattice have three coordinates of so many bits.
-_BITS = 21
 # Most bytes that are kept.
 _MOST_BYTES = 1 << 28
 
@@ -46,7 +44,7 @@ class Corners:
         """Keep what the network made at corners (n, 3), for each pair; nothing where that is too much."""
         if self._pairs * (known[0].latent.nbytes + known[0].means.nbytes) > _MOST_BYTES:
             return
-        keys = _key(np.round(self._lattice.local(points)).astype(np.int64))
+        keys = keys_of(np.round(self._lattice.local(points)).astype(np.int64))
         order = np.argsort(keys)
         self._keys = keys[order]
         self._known = [of_pair.take(order) for of_pair in known]
@@ -59,7 +57,7 @@ class Corners:
         local = np.clip(self._lattice.local(points), 0, size)
         cell = np.minimum(local.astype(np.int64), size - 1)
         weights = trilinear(local - cell)
-        keys = _key(cell[:, None] + CORNERS)
+        keys = keys_of(cell[:, None] + CORNERS)
         place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         # On a face of a cell the corners that do not lie on it count for nothing.
         known = np.all((self._keys[place] == keys) | (weights < _SAME), axis=1)
@@ -77,8 +75,3 @@ class Corners:
             return total
 
         return Coarse(mixed(known.latent), mixed(known.means), mixed(known.depth))
-
-
-def _key(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:
-    keys: NDArray[np.int64] = coordinates[..., 0] | coordinates[..., 1] << _BITS | coordinates[..., 2] << 2 * _BITS
-    return keys

@@ -314,8 +314,7 @@ class Frame:
             return
         clock = time.perf_counter()
         lights: list[Arriving] = []
-        sources = self._sent
-        for source, _ in sources:
+        for source, _ in self._sent:
             # Of so few parts, what one point sees in the middle is a poor measure: a shadow there would stand for all.
             lights += from_beams(self.types, source, _BEAMS_BACK)
         # A fraction of a fraction of the light.

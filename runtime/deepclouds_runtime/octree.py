@@ -244,7 +244,7 @@ class Octree:
     def _corner_values(self, coordinates: Array, level: int, near: Array) -> Array:
         """Values (m, 8, k) at the corners of cells (m, 3) of a level, with a point (m, 3) in or near each; unknown ones are asked for."""
         corners = (coordinates[:, None] + CORNERS) << (self._levels - level)
-        keys = corners[..., 0] | corners[..., 1] << _BITS | corners[..., 2] << 2 * _BITS
+        keys = keys_of(corners)
         unique: Array
         unique, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
         place = np.searchsorted(self._keys, unique)
@@ -310,7 +310,7 @@ class Octree:
         """
         leaves = self._leaves[..., : self.fields]
         local = (self._corners[:, None] + self._edges[:, None, None] * CORNERS).reshape(-1, 3)
-        keys = np.rint(local * 2.0**self._levels).astype(np.int64) @ (1, 1 << _BITS, 1 << 2 * _BITS)
+        keys = keys_of(np.rint(local * 2.0**self._levels).astype(np.int64))
         _, first, node = np.unique(keys, return_index=True, return_inverse=True)
         node = node.reshape(leaves.shape[:2])
         values = change(self.lattice.world(local[first]), leaves.reshape(-1, self.fields)[first])
@@ -397,6 +397,12 @@ def _worst(squared: Array, allowed: float) -> Array:
     split = np.zeros(len(squared), bool)
     split[order[np.cumsum(squared[order]) > allowed]] = True
     return split
+
+
+def keys_of(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each place of a lattice, of its coordinates (..., 3)."""
+    keys: NDArray[np.int64] = coordinates[..., 0] | coordinates[..., 1] << _BITS | coordinates[..., 2] << 2 * _BITS
+    return keys
 
 
 def trilinear(fraction: Array) -> Array:

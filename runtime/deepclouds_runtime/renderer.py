@@ -280,8 +280,9 @@ class Renderer:
         cloud, lights = Cloud(self._field, scene.albedo, scene.phase, scattering, None, exact, self._albedo, paths), self._lights()
         camera = Camera(types, scene.sensor)
         quick = self._quicker if correct else None
-        frame = Frame(scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, sampled=sampled)
-        frame.unknown = self._unknown
+        frame = Frame(
+            scene, camera, cloud, lights, lights, types, seed, self._interreflection, quick=quick, unknown=self._unknown, sampled=sampled
+        )
         frame.spent("lights", started)
         if adaptive and not walks and partial is not None:
             clock = time.perf_counter()
@@ -364,7 +365,7 @@ class Renderer:
         """What a quick look is rendered with: one collision a sample, few nodes, surfaces without the cloud's light."""
         cloud = replace(frame.cloud, exact=1)
         look = Frame(self.scene, frame.camera, cloud, lights, lights, self._types, frame.seed, False, depths=1, quick=frame.quick)
-        look.unknown = frame.unknown
+        look.unknown = self._unknown
         look.prepare(math.inf, quick=True)
         return look
 
