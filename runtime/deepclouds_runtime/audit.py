@@ -25,7 +25,7 @@ from deepclouds_runtime.transport import Cloud, Lights
 _REGIONS = 20
 # Regions darker than this share of the brightest ones do not count.
 _DARK = 0.02
-# Points at which a correction is looked at to judge it.
+# Points at which a correction is looked at to judge it, at least where there are so many walks.
 _LOOKED_AT = 1 << 16
 # Walks of a round, after which somebody is asked whether to go on. The first is judged, which costs as much as tracing some hundred
 # thousand; the next judgement follows when all that may be spent are there.
@@ -98,11 +98,10 @@ class Audit:
 
     def extend(self, walks: int) -> None:
         """Trace `walks` more walks, a fourth of them for each group; the first two groups are one half, the others the other."""
-        for group in range(GROUPS):
-            for batch in self._walks.batches(max(walks // GROUPS, 1)):
-                self._add(batch, group)
+        for batch in self._walks.batches(walks):
+            self._add(batch)
 
-    def _add(self, batch: Batch, group: int) -> None:
+    def _add(self, batch: Batch) -> None:
         predicted, walked = batch.predicted, batch.walked
         if self._sums is None:
             level = predicted.mean(axis=1, keepdims=True)
@@ -112,22 +111,24 @@ class Audit:
             mean = np.average(predicted, weights=batch.weights, axis=0)
             floor = FLOOR * np.maximum(mean.mean(keepdims=True) if self._grey else mean, 1e-30)
             self._sums = Sums(batch.points.min(axis=0), batch.points.max(axis=0), floor)
-            shape = 2, len(floor), len(self._area)
+            shape = len(floor), 2 * len(self._area)
             self._residual, self._truth, self._number = np.zeros(shape), np.zeros(shape), np.zeros(2)
             self._moments = np.zeros(2)
         if self._grey:
             predicted, walked = predicted.mean(axis=1, keepdims=True), walked.mean(axis=1, keepdims=True)
-        self._sums.add(batch.points, batch.weights, predicted, walked, group)
-        region, half, weights = self._region(batch.pixels), group // 2, batch.weights
+        weights = batch.weights
+        self._sums.add(batch.points, weights, predicted, walked, batch.groups)
+        region, half = self._region(batch.pixels), batch.groups // 2
+        place, count = half * len(self._area) + region, 2 * len(self._area)
         for c in range(len(self._sums.floor)):
-            self._residual[half, c] += np.bincount(region, weights * (predicted[:, c] - walked[:, c]), len(self._area))
-            self._truth[half, c] += np.bincount(region, weights * walked[:, c], len(self._area))
-        self._number[half] += len(weights)
+            self._residual[c] += np.bincount(place, weights * (predicted[:, c] - walked[:, c]), count)
+            self._truth[c] += np.bincount(place, weights * walked[:, c], count)
+        self._number += np.bincount(half, minlength=2)
         together = weights * (predicted - walked).sum(axis=1)
         self._moments += together.sum(), np.square(together).sum()
         self.count += len(weights)
-        if len(self._looked_at) < GROUPS:
-            few = slice(0, None, max(1, len(weights) * GROUPS // _LOOKED_AT))
+        if sum(len(points) for points, *_ in self._looked_at) < _LOOKED_AT:
+            few = slice(0, None, max(1, len(weights) // _LOOKED_AT))
             self._looked_at.append((batch.points[few], weights[few], predicted[few], region[few]))
 
     def before(self) -> RegionError:
@@ -162,12 +163,13 @@ class Audit:
 
     def _judged(self, steps: list[Array] | None) -> RegionError:
         """Error of what is audited; or with a change (channels, regions) for each half that does not depend on that half's walks."""
-        truth = self._truth.sum(axis=0) / self.count
+        halves = len(self._truth), 2, len(self._area)
+        truth = self._truth.reshape(halves).sum(axis=1) / self.count
         if not truth.sum() > 0:
             return RegionError(0.0, 0.0, 0.0, 0.0)
         level = truth / self._area
         lit = level > _DARK * np.quantile(level, 0.999)
-        errors = self._residual / np.maximum(self._number, 1)[:, None, None]
+        errors = self._residual.reshape(halves).swapaxes(0, 1) / np.maximum(self._number, 1)[:, None, None]
         product = errors[0] * errors[1]
         residual = float(self._moments[0]) / self.count
         if steps is not None:

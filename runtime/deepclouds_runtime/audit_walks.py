@@ -12,7 +12,7 @@ import numpy as np
 from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds_runtime import stratified
 from deepclouds_runtime.camera import Window
-from deepclouds_runtime.correction import FLOOR
+from deepclouds_runtime.correction import FLOOR, GROUPS
 from deepclouds_runtime.frame_source import FrameSource, seen_by
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import on_host
@@ -31,7 +31,7 @@ _AT_ONCE = 1 << 18
 
 @dataclass(frozen=True)
 class Batch:
-    """Walks from n points.
+    """Walks from n points, in groups that share nothing: no ray, no random number.
 
     Attributes
     ----------
@@ -39,14 +39,17 @@ class Batch:
         (n, 3) world points.
     pixels
         (n,) numbers of the pixels that see them.
+    groups
+        (n,) numbers of the groups that they belong to.
     weights
-        (n,) what each counts: their mean times J is that of the image's multiple scattering.
+        (n,) what each counts: the mean of weight times J, over any group, is the image's multiple scattering.
     predicted, walked
         (n, channels) J as the image has it, and of one walk each.
     """
 
     points: Array
     pixels: Array
+    groups: Array
     weights: Array
     predicted: Array
     walked: Array
@@ -81,7 +84,7 @@ class Walks:
         self.walked = LightWalks(cloud, lights)
 
     def batches(self, walks: int) -> Iterator[Batch]:
-        """Trace `walks` walks; batches share no random number. None where the camera sees no cloud."""
+        """Trace `walks` walks, an even share for each group; batches share no random number. None where the camera sees no cloud."""
         while walks > 0:
             batch = self._batch(min(walks, _AT_ONCE))
             walks -= _AT_ONCE
@@ -94,7 +97,7 @@ class Walks:
         random = np.random.default_rng(own)
         key = int(random.integers(1 << 32))
         count = self._window.count
-        rays = max(min(int(walks / _WALKS_A_RAY * self._more), _MOST_RAYS), _LEAST_RAYS)
+        rays = max(min(int(walks / _WALKS_A_RAY * self._more), _MOST_RAYS), _LEAST_RAYS) // GROUPS * GROUPS
         index = ((np.arange(rays) + random.random(rays)) * (count / rays)).astype(np.int64)
         chosen = self._window.pixels(np.minimum(index, count - 1))
         pixel = lanes_of(types.UInt32, chosen)
@@ -106,17 +109,27 @@ class Walks:
             return None
         along = np.broadcast_to(rows(direction), (rays, 3))
         predicted = predicted_at(self._sources, seen.points)
-        share = seen.weights * (self._window.share / rays)
+        share = seen.weights * (self._window.share * GROUPS / rays)
         # Walks are noisier where J is larger; some must be left for where the network sees nothing.
         level = predicted.mean(axis=1)
         wanted = share * (level + max(FLOOR * float(np.average(level, weights=share)), 1e-30))
-        total = np.cumsum(wanted)
-        place = (np.arange(walks) + random.random()) / walks * total[-1]
-        drawn = np.minimum(np.searchsorted(total, place), len(total) - 1)
-        weights = share[drawn] * (total[-1] / wanted[drawn])
-        points, of_ray = seen.points[drawn], seen.rays[drawn]
+        each = max(walks // GROUPS, 1)
+        drawn, weights, groups = [], [], []
+        for group in range(GROUPS):
+            # Each has every so-many-th ray to itself.
+            own_points = np.flatnonzero(seen.rays % GROUPS == group)
+            if not len(own_points):
+                continue
+            total = np.cumsum(wanted[own_points])
+            place = (np.arange(each) + random.random()) / each * total[-1]
+            chosen_points = own_points[np.minimum(np.searchsorted(total, place), len(total) - 1)]
+            drawn.append(chosen_points)
+            weights.append(share[chosen_points] * (total[-1] / wanted[chosen_points]))
+            groups.append(np.full(each, group))
+        which = np.concatenate(drawn)
+        points, of_ray = seen.points[which], seen.rays[which]
         walked = self.walked(points, along[of_ray], random)
-        return Batch(points, chosen[of_ray], weights, predicted[drawn], walked)
+        return Batch(points, chosen[of_ray], np.concatenate(groups), np.concatenate(weights), predicted[which], walked)
 
 
 def predicted_at(sources: Sequence[FrameSource], points: Array) -> Array:

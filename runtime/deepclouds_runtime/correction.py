@@ -33,7 +33,9 @@ _BLOCK = 3
 # Agreement of the halves, in standard deviations of what chance would give, that does not count.
 CHANCE = 0.5
 # Lattices with fewer walks a node, and all finer ones, are left out: they would cost the most and be believed the least.
-_SPARSE = 4
+_SPARSE = 32
+# A lattice looks at cells so many times halved from its own, or at the finest.
+_WITHIN = 2
 # Independent groups of walks.
 GROUPS = 4
 
@@ -66,24 +68,62 @@ class Sums:
         """World points (n, 3) in longest edges from the box's corner, inside of the box."""
         return np.clip((points - self.lower) / self.longest, 0, self.edges)
 
-    def add(self, points: Array, weights: Array, predicted: Array, walked: Array, group: int) -> None:
-        """Add walks: world points (n, 3), what each counts in the image (n,), and J (n, channels) as predicted and as walked."""
+    def add(self, points: Array, weights: Array, predicted: Array, walked: Array, groups: NDArray[np.int64] | int) -> None:
+        """Add walks: world points (n, 3), what each counts in the image (n,), J (n, channels) as predicted and as walked, groups (n,)."""
         local = self.local(points)
         cell = np.ravel_multi_index(tuple(np.minimum((local * _FINE).astype(np.int64), self._size - 1).T), tuple(self._size))
         n = len(self.count)
         self.count += np.bincount(cell, minlength=n)
         for axis in range(3):
             self._place[axis] += np.bincount(cell, local[:, axis], n)
+        place, every = groups * n + cell, (GROUPS, n)
         for c, floor in enumerate(self.floor):
             residual = weights * (walked[:, c] - predicted[:, c])
-            self.residual[group, c] += np.bincount(cell, residual, n)
-            self.scale[group, c] += np.bincount(cell, weights * (predicted[:, c] + floor), n)
+            self.residual[:, c] += np.bincount(place, residual, GROUPS * n).reshape(every)
+            self.scale[:, c] += np.bincount(place, weights * (predicted[:, c] + floor), GROUPS * n).reshape(every)
             self.square[c] += np.bincount(cell, np.square(residual), n)
 
-    def filled(self) -> tuple[Array, Array]:
-        """Cells that hold walks, and the mean place (m, 3) of the walks in each."""
-        cells = np.flatnonzero(self.count)
-        return cells, (self._place[:, cells] / self.count[cells]).T
+    def cells(self, halves: tuple[tuple[int, ...], tuple[int, ...]]) -> _Cells:
+        """The finest cells that hold walks, and what two halves of the groups have in them."""
+        filled = np.flatnonzero(self.count)
+        residual, scale = (
+            np.stack([values[list(half)][:, :, filled].sum(axis=0) for half in halves]) for values in (self.residual, self.scale)
+        )
+        cells = np.stack(np.unravel_index(filled, tuple(self._size)), axis=1)
+        share = sum(map(len, halves)) / GROUPS
+        return _Cells(cells, self.count[filled], self._place[:, filled], residual, scale, self.square[:, filled] * share)
+
+
+class _Cells:
+    """What cells of one size hold: numbers (m, 3) of the cells, walks (m,), and sums of their places, residuals and scales."""
+
+    def __init__(self, cells: NDArray[np.int64], count: Array, places: Array, residual: Array, scale: Array, variance: Array) -> None:
+        self._cells, self.count, self._places, self.residual, self.scale = cells, count, places, residual, scale
+        self.variance = variance
+        self.place = (places / count).T
+
+    def pooled(self, edges: Array) -> _Cells:
+        """The same where the variance (channels, m) of each cell's sum is that of as many walks of a wide neighbourhood."""
+        index, tent, count = _tents(self.place, cells_along(edges, _POOLED), _POOLED)
+        below = np.maximum(_at_nodes(self.count, index, tent, count), 1e-300)
+        around = [_at_nodes(of_channel, index, tent, count) / below for of_channel in self.variance]
+        variance = np.stack([self.count * (tent * of_node[index]).sum(axis=1) for of_node in around])
+        return _Cells(self._cells, self.count, self._places, self.residual, self.scale, variance)
+
+    def halved(self) -> _Cells:
+        """Cells of twice the edge."""
+        cells = self._cells // 2
+        size = cells.max(axis=0) + 1
+        filled, into = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)), return_inverse=True)
+
+        def together(values: Array) -> Array:
+            flat = values.reshape(-1, values.shape[-1])
+            return np.stack([np.bincount(into, row, len(filled)) for row in flat]).reshape(*values.shape[:-1], len(filled))
+
+        numbers = np.stack(np.unravel_index(filled, tuple(size)), axis=1)
+        return _Cells(
+            numbers, *(together(v) for v in (self.count, self._places, self.residual, self.scale, self.variance))
+        )
 
 
 class Correction:
@@ -106,44 +146,34 @@ class Correction:
         self._sums = sums
         channels = len(sums.floor)
         self._field, self._level, self.levels = np.zeros((1, 1, 1, channels)), -1, 0
-        cells, place = sums.filled()
-        if not len(cells):
+        if not sums.count.any():
             return
-        residual, scale = ([values[list(h)][:, :, cells].sum(axis=0) for h in halves] for values in (sums.residual, sums.scale))
-        variance = self._variance(cells, place) * (len(halves[0]) + len(halves[1])) / GROUPS
-        field, known = self._field, np.zeros((channels, len(cells)))
+        sizes = [sums.cells(halves).pooled(sums.edges)]
+        while len(sizes) < _LEVELS:
+            sizes.append(sizes[-1].halved())
+        field = self._field
         for level in range(-1, _LEVELS):
+            cells = sizes[max(_LEVELS - 1 - _WITHIN - level, 0)]
             size = cells_along(sums.edges, level)
             field = _refined(field, size, level)
-            index, tent, count = _tents(place, size, level)
-            if sums.count.sum() < _SPARSE * np.count_nonzero(_at_nodes(np.ones(len(cells)), index, tent, count)):
+            index, tent, count = _tents(cells.place, size, level)
+            if cells.count.sum() < _SPARSE * np.count_nonzero(_at_nodes(np.ones(len(cells.count)), index, tent, count)):
                 break
+            known = np.einsum("mk,mkc->cm", tent, field.reshape(count, channels)[index])
             values = np.zeros((count, channels))
             for c in range(channels):
-                left = [_at_nodes(r[c] - s[c] * known[c], index, tent, count) for r, s in zip(residual, scale, strict=True)]
-                below = [_at_nodes(s[c], index, tent, count) for s in scale]
-                values[:, c] = _shrunken(left, below, _at_nodes(variance[c], index, np.square(tent), count), size)
+                left = [_at_nodes(r[c] - s[c] * known[c], index, tent, count) for r, s in zip(cells.residual, cells.scale, strict=True)]
+                below = [_at_nodes(s[c], index, tent, count) for s in cells.scale]
+                values[:, c] = _shrunken(left, below, _at_nodes(cells.variance[c], index, np.square(tent), count), size)
             if not values.any():
                 continue
             if level >= 0:
                 # What the image is brighter or darker as a whole, the single number knows best: a finer level only moves light about.
-                moved, total = np.einsum("mk,mkc->cm", tent, values[index]), scale[0] + scale[1]
+                moved, total = np.einsum("mk,mkc->cm", tent, values[index]), cells.scale.sum(axis=0)
                 values -= (moved * total).sum(axis=1) / np.maximum(total.sum(axis=1), 1e-300)
             field = field + values.reshape(field.shape)
-            flat = field.reshape(count, channels)
-            known = np.einsum("mk,mkc->cm", tent, flat[index])
             self._field, self._level = field, level
             self.levels += 1
-
-    def _variance(self, cells: Array, place: Array) -> Array:
-        """Variance (channels, m) of the sum of the residuals of all walks in each cell, from those of a wide neighbourhood."""
-        sums = self._sums
-        index, tent, count = _tents(place, cells_along(sums.edges, _POOLED), _POOLED)
-        walks = sums.count[cells]
-        below = np.maximum(_at_nodes(walks, index, tent, count), 1e-300)
-        pooled = [_at_nodes(square[cells], index, tent, count) / below for square in sums.square]
-        result: Array = np.stack([walks * (tent * of_node[index]).sum(axis=1) for of_node in pooled])
-        return result
 
     def __call__(self, points: Array) -> Array:
         """The field d (n, channels) at world points (n, 3); beyond the walks it goes on as at the nearest place that they know."""
@@ -185,8 +215,11 @@ def _around(nodes: Array, size: Array, values: Sequence[Array]) -> list[Array]:
     for value in values:
         grid = np.bincount(index, value, int(np.prod(blocks))).reshape(blocks)
         for axis in range(3):
-            along = np.moveaxis(np.pad(grid, [(int(a == axis),) * 2 for a in range(3)]), axis, 0)
-            grid = np.moveaxis(along[:-2] + along[1:-1] + along[2:], 0, axis)
+            along, total = np.moveaxis(grid, axis, 0), grid.copy()
+            sums = np.moveaxis(total, axis, 0)
+            sums[1:] += along[:-1]
+            sums[:-1] += along[1:]
+            grid = total
         found.append(grid.ravel()[index])
     return found
 

@@ -69,6 +69,8 @@ class LightWalks:
             return result
         power = np.array([light.power for light in self._connected])
         share = power / power.sum() if len(power) else np.ones(1)
+        if len(share) == 1:
+            return self._of_one(points, along, self._connected[0] if self._connected else None, 1.0, key, random)
         # As many walks for each as it has light, and no walk knows which are beside it.
         places = (random.permutation(n) + random.random()) / n
         which = np.minimum(np.searchsorted(np.cumsum(share), places, side="right"), len(share) - 1)
