@@ -26,7 +26,7 @@ _REGIONS = 20
 # Regions darker than this share of the brightest ones do not count.
 _DARK = 0.02
 # Points at which a correction is looked at to judge it, at least where there are so many walks.
-_LOOKED_AT = 1 << 16
+_LOOKED_AT = 1 << 15
 # Walks of a round, after which somebody is asked whether to go on. The first is judged, which costs as much as tracing some hundred
 # thousand; the next judgement follows when all that may be spent are there.
 ROUND = 1 << 18
@@ -130,6 +130,11 @@ class Audit:
         if sum(len(points) for points, *_ in self._looked_at) < _LOOKED_AT:
             few = slice(0, None, max(1, len(weights) // _LOOKED_AT))
             self._looked_at.append((batch.points[few], weights[few], predicted[few], region[few]))
+
+    @property
+    def filled(self) -> int:
+        """Cells that walks have begun in: with their number grows what it takes to judge."""
+        return 0 if self._sums is None else int(np.count_nonzero(self._sums.count))
 
     def before(self) -> RegionError:
         """Error of what is audited."""
@@ -239,16 +244,16 @@ def audited(
         reached = audit.remaining() if correct else before
         if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
             break
-        # To judge once more and to apply a correction take about four times as long as to judge.
-        ending = 4 * (time.perf_counter() - clock)
-        if not more(ending):
+        # To judge once more and to apply a correction take about three times as long as to judge, and more where more cells are filled.
+        ending = 3 * (time.perf_counter() - clock) / audit.filled
+        if not more(ending * audit.filled):
             break
         if correct and 1.1 * audit.count > limit and reached.squared + reached.squared_deviation > (_FAR * error) ** 2:
             limit = min(_FURTHER * most, max(MOST, most))
         # A last round that adds little tells nothing new.
         if 1.1 * audit.count > limit:
             break
-        while audit.count < limit and more(ending):
+        while audit.count < limit and more(ending * audit.filled):
             audit.extend(min(at_once, limit - audit.count))
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}
     if correct:

@@ -30,7 +30,7 @@ _GAIN = 3.0
 # Error that is taken for that of root cells, of which nothing is known, over the mean value.
 _UNMEASURED = 0.15
 # Times that values at the nodes are drawn to what is wanted between them.
-_SWEEPS = 8
+_SWEEPS = 4
 # New corners of a cell that is split: neighbours share most of the 19 that all of its children have.
 _NODES_A_SPLIT = 7
 

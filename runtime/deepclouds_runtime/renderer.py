@@ -309,7 +309,10 @@ class Renderer:
                     one /= max((count for _, count in sources), default=1)
                     frame.on_cloud = replace(frame.on_cloud, sources=tuple((source, 1) for source, _ in sources))
                 spare = left - one
-                until = now + min(max(left - all_of_them, _AUDIT[0] * spare), _AUDIT[1] * spare)
+                seconds = min(max(left - all_of_them, _AUDIT[0] * spare), _AUDIT[1] * spare)
+                # What is too short for another sample is for walks.
+                seconds = max(seconds, min(left - (left - seconds) // one * one, _AUDIT[1] * spare))
+                until = now + seconds
             frame.audit(correct, 0.0 if timed else error, until, interrupted)
 
         def so_far(noise: float) -> RenderResult:

@@ -83,13 +83,14 @@ def rounds_for_error(
     while frame.samples < most and (target is None or not noise <= target):
         if watch.stops:
             return noise, True
-        before, done = frame.film.beauty(), frame.samples
+        done = frame.samples
         more = min(math.ceil(done * (growth - 1)), most - done)
         if not math.isinf(end):
             left = end - time.perf_counter()
             more = min(more, int(left / pace)) if left > 0 else 0
         if more < 1:
             break
+        before = frame.film.beauty()
         if watch.partial is not None:
             watch.partial(so_far(noise))
         clock = time.perf_counter()
