@@ -16,7 +16,7 @@ import numpy as np
 
 from deepclouds_runtime.audit_walks import Batch, Rays, Walks
 from deepclouds_runtime.camera import Window
-from deepclouds_runtime.correction import FLOOR, GROUPS, Correction, Sums
+from deepclouds_runtime.correction import FLOOR, Correction, Sums
 from deepclouds_runtime.frame_source import FrameSource
 from deepclouds_runtime.octree import Array
 from deepclouds_runtime.transport import Cloud, Lights

@@ -121,9 +121,7 @@ class _Cells:
             return np.stack([np.bincount(into, row, len(filled)) for row in flat]).reshape(*values.shape[:-1], len(filled))
 
         numbers = np.stack(np.unravel_index(filled, tuple(size)), axis=1)
-        return _Cells(
-            numbers, *(together(v) for v in (self.count, self._places, self.residual, self.scale, self.variance))
-        )
+        return _Cells(numbers, *(together(v) for v in (self.count, self._places, self.residual, self.scale, self.variance)))
 
 
 class Correction:

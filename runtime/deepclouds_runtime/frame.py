@@ -176,10 +176,13 @@ class Frame:
         if self.sources is None or self.sampled:
             return {"thin samples": self.counts.skipped}
         distinct = len({a for a in self.cloud.albedo if a > 0})
+        spared = sum(source.spared for source in self.sources)
+        evaluations = (sum(source.queries for source in self.sources) + spared) // max(distinct, 1)
         return {
             "samples that met no cloud": self.counts.camera_samples - self.counts.cloud_samples,
             "samples interpolated": self.counts.cloud_samples,
-            "equal colour channels": sum(s.queries for s in self.sources) // max(distinct, 1) * (len(self.cloud.albedo) - distinct),
+            "equal colour channels": evaluations * (len(self.cloud.albedo) - distinct),
+            "albedos between two others": spared,
             "suns without power": sum(max(sun.irradiance) <= 0 for sun in self.on_cloud.suns),
         }
 

@@ -69,6 +69,8 @@ class FrameSource:
         two more fields, where the network knows its errors: the sum of `octree`'s, and the error to expect of it.
     built
         the octree on the host.
+    spared
+        queries of albedos that lie between two others, which were not made.
     """
 
     octree: DeviceOctree
@@ -82,6 +84,7 @@ class FrameSource:
     doubt: DeviceOctree | None = None
     built: Octree | None = None
     level: float = 1.0
+    spared: int = 0
 
     def corrected(self, correction: Callable[[Array], Array], floor: Array, points: Array, weights: Array) -> FrameSource:
         """J + (J + floor) d in the place of J, with d = correction(world points), as well as the nodes can have it; nowhere below 0.
@@ -296,7 +299,7 @@ class Evaluates(Protocol):
 
     Attributes
     ----------
-    mix, queries, shared, model
+    mix, queries, shared, spared, model
         see `FrameSource`.
     carried
         so many of the fields are not J but the sum of the others and the error to expect of it.
@@ -305,6 +308,7 @@ class Evaluates(Protocol):
     mix: Array
     queries: int
     shared: int
+    spared: int
     model: str
     carried: int
 
@@ -377,7 +381,7 @@ def interpolated(
     level = float(means @ evaluate.mix.mean(axis=0)) if len(means) == evaluate.mix.shape[1] else 1.0
     doubt = octree.upload(field.types, carried=True) if evaluate.carried else None
     asked = evaluate.queries, evaluate.shared, lights, evaluate.model
-    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, *asked, doubt, octree, level)
+    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, *asked, doubt, octree, level, evaluate.spared)
 
 
 def part_of_time(until: float, share: float) -> float:

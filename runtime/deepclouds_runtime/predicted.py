@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of, vectors_of
 from deepclouds.medium.optical_depth import optical_depth
+from deepclouds_runtime.between_albedos import TOLD, BetweenAlbedos
 from deepclouds_runtime.corners import Corners
 from deepclouds_runtime.lights import on_host
 from deepclouds_runtime.octree import Array, Lattice
@@ -52,8 +53,9 @@ class Predicted:
         eyes: Sequence[Sees],
         combine: Callable[[Array], Array],
     ) -> None:
-        self._cloud, self._network, self._lights, self._albedos, self._eyes, self._combine = cloud, network, lights, albedos, eyes, combine
-        self.queries, self.shared = 0, 0
+        self._cloud, self._network, self._lights, self._eyes, self._combine = cloud, network, lights, eyes, combine
+        self.queries, self.shared, self.spared = 0, 0, 0
+        self._between = BetweenAlbedos(albedos if cloud.varying is None else ())
         # How many coarse levels points in a cell share, and what is known of them at its corners.
         self._levels = 0
         self._corners: Corners | None = None
@@ -150,9 +152,17 @@ class Predicted:
         where = np.tile(points, (len(pairs), 1))
         x, omega = vectors_of(types, where), vectors_of(types, omegas)
         depth = np.array(optical_depth(field, x, omega, types.Float(0), types.Float(math.inf), types.Bool(True), _DEEP))
+        if not self._between.learned:
+            some = np.linspace(0, len(where) - 1, min(len(where), TOLD)).astype(np.int64)
+            told, *_ = self._ask(where[some], toward[some], omegas[some], self._between.albedos, depth[some], None, False)
+            self.queries += told.size
+            self._between.learn(told)
         albedos, columns, square = self._at(points, len(pairs))
         j, errors, made = self._ask(where, toward, omegas, albedos, depth, coarse, keep)
         self.queries += j.size
+        if self._cloud.varying is None:
+            j, errors = self._between.filled(j, errors)
+            self.spared += j.size - len(where) * len(albedos)
         j, errors = (v[:, columns].reshape(len(pairs), n, -1) * square for v in (j, errors))
         x = vectors_of(types, points)
         for (e, _), light, values, expected in zip(pairs, lights, j, errors, strict=True):
@@ -195,13 +205,13 @@ class Predicted:
         return j, errors, made
 
     def _at(self, points: Array, times: int) -> tuple[Albedos, list[int], Array]:
-        """The albedos to ask for at points that are repeated, which of them each field has, and what its values are multiplied by.
+        """The albedos to ask for at points that are repeated, which of all each field has, and what its values are multiplied by.
 
         A network knows one albedo a query. Where it varies, that is its mean over the medium around the point: walks correct the rest.
         """
         varying, field = self._cloud.varying, self._cloud.field
         if varying is None:
-            return self._albedos, list(range(len(self._albedos))), np.ones(1)
+            return self._between.asked, list(range(len(self._between.albedos))), np.ones(1)
         types, n = field.types, len(points)
         own = on_host(self._cloud.albedo_at(vectors_of(types, points)), n)
         around = np.random.default_rng(_AROUND).normal(size=(_AROUND, 3)) * (_REACH * self._network.descriptor.unit)

@@ -43,8 +43,7 @@ class Statistics:
         both parts of the image's error, and how they are known: see `deepclouds_runtime.error_parts.error_parts`.
     audit
         where walks audited the network: ``walks``; ``network``, its error over regions of the image, root of the mean square over the mean,
-        and its energy, each with an interval of 95 %; whether it was ``corrected``, on how many ``levels``, and what is ``remaining``; and
-        ``thrown``, where surfaces see the cloud: by what ``factor`` its light on them was multiplied, by channel, and its ``deviation``.
+        and its energy, each with an interval of 95 %; whether it was ``corrected``, on how many ``levels``, and what is ``remaining``.
     memory
         bytes: ``field``, of density, extinction and majorants; ``levels``, of the field filtered for the network; ``peak``, what the whole
         process had at most so far.

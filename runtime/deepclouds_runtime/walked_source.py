@@ -74,7 +74,7 @@ class _Walked:
         self._random = np.random.default_rng([seed & 0xFFFFFFFF, 0x3C1D])
         self.mix: Array = np.eye(channels)
         self.carried = 2 if network.knows_errors else 0
-        self.queries, self.shared, self.model, self.each = 0, 0, "", _TRIALS
+        self.queries, self.shared, self.spared, self.model, self.each = 0, 0, 0, "", _TRIALS
 
     def choose(self, seen: Seen) -> None:
         """Set how many walks start at a node, from a trial at what the camera sees."""

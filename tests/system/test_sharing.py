@@ -1,5 +1,7 @@
 """Rationale: nodes that stand in one cell of the coarsest ones share what the network makes of the coarse levels of their stencils.
 
+Colour channels share queries too: of three albedos two are asked for.
+
 Expected behaviour: the image stays what it is but for much less than the network's own error; where corners cannot tell, at edges that
 see the light and along it, the network is asked in full; networks that cannot be cut share nothing.
 """
@@ -86,3 +88,19 @@ def test_corners_tell_nothing_along_the_light_and_at_edges() -> None:
     toward = np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1], [0.01, 0, -0.99995]])
     light = np.broadcast_to([0.0, 0, 1], (n, 3))
     assert _between(coarse, toward, light, np.array([3.1, 1.5, 3.0, 3.0])).tolist() == [True, False, False, False]
+
+
+def test_the_middle_of_three_albedos_is_not_asked_for(smoke: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer = load(smoke)
+    found = renderer.render(16, 3)
+    monkeypatch.setattr("deepclouds_runtime.between_albedos._WRONG", 0.0)
+    full = renderer.render(16, 3)
+    (fewer, spared), (queries, none) = (
+        (image.statistics.sources["suns"]["queries"], image.statistics.skipped["albedos between two others"]) for image in (found, full)
+    )
+    assert none == 0
+    assert fewer + spared == pytest.approx(queries, rel=0.05)
+    assert fewer < 0.8 * queries
+    first, middle, last = np.linalg.norm(found.rgb - full.rgb, axis=(0, 1)) / np.linalg.norm(full.rgb, axis=(0, 1))
+    assert 0 < middle < 0.03
+    assert max(first, last) < 0.005
