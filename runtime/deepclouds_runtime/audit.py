@@ -34,6 +34,9 @@ ROUND = 1 << 18
 WALKS_A_PIXEL, WALKS_A_SIGHT, FEWEST, MOST = 4, 32, 1 << 18, 1 << 22
 # Where what is left may still be so many times what was asked for, walks go on to so many times their number.
 _FAR, _FURTHER = 1.25, 3
+# Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the
+# root of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
+_SHARE = (0.65, 0.9)
 # Standard deviations of an interval of 95 %.
 _INTERVAL = 1.96
 # Channels whose ratio at the points differs by less than this are corrected as one.
@@ -263,3 +266,23 @@ def audited(
             found |= {"corrected": True, "levels": correction.levels, "remaining": reached.summary()}
             return Outcome(audit.corrected(correction), found)
     return Outcome(list(sources), found)
+
+
+def time_for_walks(left: float, one: float, every: float) -> float:
+    """Seconds that walks may take of those that are `left`.
+
+    Parameters
+    ----------
+    left
+        seconds until the image is to be done.
+    one, every
+        seconds that one sample of each pixel will take, and all samples that are wanted.
+
+    Returns
+    -------
+    What is left by all samples, within limits; and what would be too short for another sample.
+    """
+    least, most = (share * (left - one) for share in _SHARE)
+    seconds = min(max(left - every, least), most)
+    samples = (left - seconds) // one
+    return max(seconds, min(left - samples * one, most))

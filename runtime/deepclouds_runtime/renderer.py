@@ -17,6 +17,7 @@ from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
 from deepclouds.memory import peak_bytes
 from deepclouds_runtime._mitsuba import mitsuba, types_of
+from deepclouds_runtime.audit import time_for_walks
 from deepclouds_runtime.camera import Camera
 from deepclouds_runtime.confidence import doubtful, warning
 from deepclouds_runtime.error_parts import error_parts
@@ -36,9 +37,6 @@ MODES = ("fast", "reference")
 _MOST_SAMPLES = 1 << 20
 # What the fast mode stops at by itself: a scene whose noise is still too large then says so.
 _MOST_AUTOMATIC = 1024
-# Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the
-# root of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
-_AUDIT = (0.65, 0.9)
 # Where one sample a pixel takes more of what is left than this, each draws one direction from an environment.
 _DEAR = 0.4
 # Of a time limit, what predictions may take where walks correct them and where nothing does, and of the former what is left for them
@@ -308,11 +306,7 @@ class Renderer:
                     # Shadow rays toward the environment are most of what a sample costs.
                     one /= max((count for _, count in sources), default=1)
                     frame.on_cloud = replace(frame.on_cloud, sources=tuple((source, 1) for source, _ in sources))
-                spare = left - one
-                seconds = min(max(left - all_of_them, _AUDIT[0] * spare), _AUDIT[1] * spare)
-                # What is too short for another sample is for walks.
-                seconds = max(seconds, min(left - (left - seconds) // one * one, _AUDIT[1] * spare))
-                until = now + seconds
+                until = now + time_for_walks(left, one, all_of_them)
             frame.audit(correct, 0.0 if timed else error, until, interrupted)
 
         def so_far(noise: float) -> RenderResult:
