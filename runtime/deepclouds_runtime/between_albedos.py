@@ -1,7 +1,7 @@
 """J at albedos between two others, without a query: its logarithm lies between theirs, at about the same place all over a cloud.
 
-Light of n more scatterings is in proportion to the n-th power of the albedo: a sum of such powers is convex in it, and between the mean
-and the largest n that count its logarithm hardly bends. Where between the two it lies depends on the medium: some queries tell.
+J is a sum of powers of the albedo, one for each number of scatterings, so that log J rises smoothly with it. Where between the least and
+the greatest albedo's it lies depends on how often light is scattered in the medium at hand: some queries of all albedos tell.
 """
 
 from __future__ import annotations
