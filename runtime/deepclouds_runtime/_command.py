@@ -15,6 +15,9 @@ from deepclouds.errors import InputError
 from deepclouds_runtime._job import ERROR_OF_FRAMES, Plan, corrects, plan
 from deepclouds_runtime.sequence import parse_frames
 
+# Seconds of a time limit in which nodes of the default model are too few.
+_SHORT = 2.0
+
 _PAIR = "AZ,EL"
 
 
@@ -106,7 +109,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--time",
         type=float,
         metavar="SECONDS",
-        help="end in time; without --error all of it is used, in a corrected image with the model 'fast'. "
+        help=f"end in time; without --error all of it is used, in a corrected image of less than {_SHORT:g} seconds with the model 'fast'. "
         "The image then depends on the machine",
     )
     parser.add_argument(
@@ -241,8 +244,9 @@ def run(argv: Sequence[str], prog: str) -> int:
 
 
 def _model(arguments: argparse.Namespace, made: Plan) -> str | None:
-    """The model to load: where walks correct what the time allows, the quick one leaves them more of it, and ends no worse."""
-    if arguments.model is None and arguments.time is not None and arguments.error is None and corrects(arguments, made):
+    """The model to load: in a short time walks have more of it left by the quick one."""
+    short = arguments.time is not None and arguments.time < _SHORT
+    if arguments.model is None and short and arguments.error is None and corrects(arguments, made):
         return "fast"
     model: str | None = arguments.model
     return model

@@ -166,24 +166,45 @@ def _from_afar(scene: Path, size: int) -> Path:
     return path
 
 
-def test_a_cloud_far_away_is_corrected_as_well(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seven pixels of a thousand show it: rays through all of them would start every walk at the same few points."""
-    far = _from_afar(scene, 240)
-    starts = []
+def _watched(monkeypatch: pytest.MonkeyPatch) -> list[Batch]:
+    """All batches of walks from now on."""
+    seen: list[Batch] = []
     batches = Walks.batches
 
     def watched(self: Walks, walks: int) -> Iterator[Batch]:
         for batch in batches(self, walks):
-            starts.append(batch.points)
+            seen.append(batch)
             yield batch
 
     monkeypatch.setattr(Walks, "batches", watched)
+    return seen
+
+
+def test_groups_of_walks_share_no_point(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Halves that began at the same points would agree on what is wrong there alone."""
+    seen = _watched(monkeypatch)
+    rendered(scene, monkeypatch, "smooth", audit=True)
+    for batch in seen:
+        number = np.bincount(batch.groups, minlength=GROUPS)
+        assert np.all(number == number[0])
+        points = [{tuple(p) for p in batch.points[batch.groups == group]} for group in range(GROUPS)]
+        assert len(set().union(*points)) == sum(map(len, points))
+        # Each group alone knows the image's light: its walks as drawn, and what they find.
+        for values, tolerance in ((batch.predicted, 0.02), (batch.walked, 0.1)):
+            means = [float((batch.weights[:, None] * values)[batch.groups == group].mean()) for group in range(GROUPS)]
+            assert means == pytest.approx([float(np.mean(means))] * GROUPS, rel=tolerance)
+
+
+def test_a_cloud_far_away_is_corrected_as_well(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven pixels of a thousand show it: rays through all of them would start every walk at the same few points."""
+    far = _from_afar(scene, 240)
+    starts = _watched(monkeypatch)
     true, wrong, right = (
         rendered(far, monkeypatch, kind, **how) for kind, how in (("exact", {}), ("smooth", {}), ("smooth", {"correct": True}))
     )
     shown = true.rgb.sum(axis=2) > 0
     assert 50 < shown.sum() < 500
-    points = np.concatenate(starts)
+    points = np.concatenate([batch.points for batch in starts])
     assert len(np.unique(points, axis=0)) > len(points) // 64
 
     def error(image: RenderResult) -> float:
