@@ -104,7 +104,7 @@ def test_a_corrected_image_asks_the_network_and_is_that_of_paths(tmp_path: Path)
       </medium></shape></scene>""")
     renderer = load(scene)
     halves = [renderer.render(2000, seed=s) for s in (1, 2)]
-    image, alone = (renderer.render(error=0.02, seed=3, correct=correct, audit=not correct) for correct in (True, False))
+    image, alone = (renderer.render(error=0.01, seed=3, correct=correct, audit=not correct) for correct in (True, False))
     assert [r.statistics.mode for r in (*halves, image, alone)] == ["path-traced"] * 2 + ["fast", "path-traced"]
     assert image.statistics.audit["corrected"]
     assert image.counts.queries > 0
@@ -118,5 +118,5 @@ def test_a_corrected_image_asks_the_network_and_is_that_of_paths(tmp_path: Path)
     error = np.sqrt(max(float(np.mean((ours - a) * (ours - b))), 0.0)) / mean.mean()
     noise = np.sqrt(float(np.mean(np.square(a - b))) / 2) / mean.mean()
     assert noise < 0.15
-    assert error < 0.04
+    assert error < 0.03
     np.testing.assert_allclose(ours.mean(axis=(0, 1)), mean.mean(axis=(0, 1)), rtol=0.015)
