@@ -114,7 +114,7 @@ class Audit:
             mean = np.average(predicted, weights=batch.weights, axis=0)
             floor = FLOOR * np.maximum(mean.mean(keepdims=True) if self._grey else mean, 1e-30)
             self._sums = Sums(batch.points.min(axis=0), batch.points.max(axis=0), floor)
-            shape = len(floor), 2 * len(self._area)
+            shape = len(floor), 2, len(self._area)
             self._residual, self._truth, self._number = np.zeros(shape), np.zeros(shape), np.zeros(2)
             self._moments = np.zeros(2)
         if self._grey:
@@ -122,10 +122,10 @@ class Audit:
         weights = batch.weights
         self._sums.add(batch.points, weights, predicted, walked, batch.groups)
         region, half = self._region(batch.pixels), batch.groups // 2
-        place, count = half * len(self._area) + region, 2 * len(self._area)
+        place, halves = half * len(self._area) + region, (2, len(self._area))
         for c in range(len(self._sums.floor)):
-            self._residual[c] += np.bincount(place, weights * (predicted[:, c] - walked[:, c]), count)
-            self._truth[c] += np.bincount(place, weights * walked[:, c], count)
+            self._residual[c] += np.bincount(place, weights * (predicted[:, c] - walked[:, c]), 2 * len(self._area)).reshape(halves)
+            self._truth[c] += np.bincount(place, weights * walked[:, c], 2 * len(self._area)).reshape(halves)
         self._number += np.bincount(half, minlength=2)
         together = weights * (predicted - walked).sum(axis=1)
         self._moments += together.sum(), np.square(together).sum()
@@ -171,13 +171,12 @@ class Audit:
 
     def _judged(self, steps: list[Array] | None) -> RegionError:
         """Error of what is audited; or with a change (channels, regions) for each half that does not depend on that half's walks."""
-        halves = len(self._truth), 2, len(self._area)
-        truth = self._truth.reshape(halves).sum(axis=1) / self.count
+        truth = self._truth.sum(axis=1) / self.count
         if not truth.sum() > 0:
             return RegionError(0.0, 0.0, 0.0, 0.0)
         level = truth / self._area
         lit = level > _DARK * np.quantile(level, 0.999)
-        errors = self._residual.reshape(halves).swapaxes(0, 1) / np.maximum(self._number, 1)[:, None, None]
+        errors = self._residual.swapaxes(0, 1) / np.maximum(self._number, 1)[:, None, None]
         product = errors[0] * errors[1]
         residual = float(self._moments[0]) / self.count
         if steps is not None:
