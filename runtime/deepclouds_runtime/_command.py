@@ -244,7 +244,7 @@ def run(argv: Sequence[str], prog: str) -> int:
 
 
 def _model(arguments: argparse.Namespace, made: Plan) -> str | None:
-    """The model to load: in a short time walks have more of it left by the quick one."""
+    """The model to load: in a short time the quick one, of which more nodes are ready."""
     short = arguments.time is not None and arguments.time < _SHORT
     if arguments.model is None and short and arguments.error is None and corrects(arguments, made):
         return "fast"

@@ -160,9 +160,8 @@ class Predicted:
         albedos, columns, square = self._at(points, len(pairs))
         j, errors, made = self._ask(where, toward, omegas, albedos, depth, coarse, keep)
         self.queries += j.size
-        if self._cloud.varying is None:
-            j, errors = self._between.filled(j, errors)
-            self.spared += j.size - len(where) * len(albedos)
+        j, errors = self._between.filled(j, errors)
+        self.spared += j.size - len(where) * len(albedos)
         j, errors = (v[:, columns].reshape(len(pairs), n, -1) * square for v in (j, errors))
         x = vectors_of(types, points)
         for (e, _), light, values, expected in zip(pairs, lights, j, errors, strict=True):
