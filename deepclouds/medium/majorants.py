@@ -14,12 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of
+from deepclouds.medium.elementary import log_of_share
 from deepclouds.volume.bricks import EDGE, Bricks
 
 # Edge of a brick, in voxels of the smallest edge.
 BRICK = 4
 # Blocks end this far beyond their last brick, in voxels: more than float32 rounds, less than the half voxel that the bound allows.
 _BEYOND = 0.01
+# Stands for a majorant of 0 where it is divided by, 1 / world length.
+_LEAST = np.float32(1e-30)
 # Mean distance from the centre of a cube of edge 1 to its surface.
 _MEAN_EXIT = 0.61
 
@@ -85,13 +88,15 @@ class Majorants:
         self.any_empty = bool(np.any(self.empty_radius >= 0))
         count = self.bound.shape[::-1]
         self._types = types
-        self._table = lanes_of(types.Float, np.stack([self.block_bound, self.radius], axis=-1).ravel())
+        mean_path = 1 / np.maximum(self.block_bound, _LEAST)
+        self._table = lanes_of(types.Float, np.stack([mean_path, self.radius], axis=-1).ravel())
         self._empty = lanes_of(types.Float, self.empty_radius.ravel())
         kept = (self.bound, self.radius, self.block_bound, self.empty_radius)
         self.nbytes = sum(a.nbytes for a in kept) + 4 * 3 * self.bound.size
         self._per_unit = [dr.opaque(types.Float, float(n / b)) for n, b in zip(shape, self.bricks, strict=True)]
         self._edge = [dr.opaque(types.Float, float(b / n)) for n, b in zip(shape, self.bricks, strict=True)]
-        self._beyond = [dr.opaque(types.Float, float(_BEYOND / n)) for n in shape]
+        self._half = [dr.opaque(types.Float, float(0.5 * b / n)) for n, b in zip(shape, self.bricks, strict=True)]
+        self._beyond = [dr.opaque(types.Float, float((0.5 * b + _BEYOND) / n)) for n, b in zip(shape, self.bricks, strict=True)]
         self._last = [dr.opaque(types.Float, float(n - 1)) for n in count]
         self._stride_y, self._stride_z = dr.opaque(types.UInt32, count[0]), dr.opaque(types.UInt32, count[0] * count[1])
 
@@ -114,16 +119,16 @@ class Majorants:
         distance
             where the lane is then; never less than before.
         tentative
-            whether there is a tentative collision, real with probability ``sigma_t / majorant``.
-        majorant
-            that of the block, 1 / world length.
+            whether there is a tentative collision.
+        mean_path
+            mean free path in the block, world length: with probability ``sigma_t * mean_path`` the tentative collision is real.
         """
         cell, index = self._brick(dr.fma(along, distance, origin))
-        majorant = dr.gather(self._types.Float, self._table, 2 * index, active)
+        mean_path = dr.gather(self._types.Float, self._table, 2 * index, active)
         radius = dr.gather(self._types.Float, self._table, 2 * index + 1, active)
         end = self._exit(cell, radius, origin, along)
-        reached = distance - dr.log(1 - u) / dr.maximum(majorant, 1e-30)
-        return dr.maximum(dr.minimum(reached, end), distance), reached < end, majorant
+        reached = dr.fma(-log_of_share(self._types, 1 - u), mean_path, distance)
+        return dr.maximum(dr.minimum(reached, end), distance), reached < end, mean_path
 
     def empty(self, at: Any, active: Any) -> tuple[Any, Any]:
         """Whether the bricks at `at`, points in the unit cube of the box, are empty, and the radii of their empty blocks for `end`."""
@@ -142,12 +147,16 @@ class Majorants:
         return cell, index[0] + index[1] * self._stride_y + index[2] * self._stride_z
 
     def _exit(self, cell: list[Any], radius: Any, origin: Any, along: Any) -> Any:
-        distance = self._types.Float(np.inf)
-        for c, edge, beyond, o, a in zip(cell, self._edge, self._beyond, origin, along, strict=True):
-            forward = a >= 0
-            face = dr.select(forward, c + 1 + radius, c - radius) * edge
-            distance = dr.minimum(distance, (dr.select(forward, face - o, o - face) + beyond) / dr.abs(a))
-        return distance
+        # On each axis the way to the middle of the block and half of its edge, over the speed; the least of the three by one division.
+        way, speed = None, None
+        for c, edge, half, beyond, o, a in zip(cell, self._edge, self._half, self._beyond, origin, along, strict=True):
+            own_way, own_speed = dr.fma(radius, edge, beyond) + dr.mulsign(dr.fma(c, edge, half) - o, a), dr.abs(a)
+            if way is None:
+                way, speed = own_way, own_speed
+                continue
+            sooner = own_way * speed < way * own_speed
+            way, speed = dr.select(sooner, own_way, way), dr.select(sooner, own_speed, speed)
+        return way / speed
 
 
 def _brick_maxima(sigma: NDArray[np.float32], bricks: NDArray[Any]) -> NDArray[np.float32]:

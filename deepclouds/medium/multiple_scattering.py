@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of
 from deepclouds.medium.field import Field
-from deepclouds.medium.phase import as_lobes, hg, rotate_to, sample_hg_cosine, sample_two_lobe_cosine, two_lobe
+from deepclouds.medium.elementary import circle
+from deepclouds.medium.phase import as_lobes, hg, inverse_hg, sample_hg, sample_two_lobe_cosine, turned, two_lobe
 
 # Lanes begin walks at every so many steps.
 _TURN = 4
@@ -164,8 +165,23 @@ def _phase(lobes: list[Any], cos_theta: Any) -> Any:
     return hg(cos_theta, *lobes) if len(lobes) == 1 else two_lobe(cos_theta, *lobes)
 
 
-def _sample_cosine(lobes: list[Any], u: Any) -> Any:
-    return sample_hg_cosine(u, *lobes) if len(lobes) == 1 else sample_two_lobe_cosine(u, *lobes)
+def _inverse(lobes: list[Any], cos_theta: Any) -> Any:
+    """One over the phase function, sr."""
+    return inverse_hg(cos_theta, *lobes) if len(lobes) == 1 else dr.rcp(two_lobe(cos_theta, *lobes))
+
+
+def _sample(lobes: list[Any], u: Any) -> tuple[Any, Any]:
+    """One minus the cosine of a scattering angle, and one over the phase function there, sr."""
+    if len(lobes) == 1:
+        return sample_hg(u, *lobes)
+    cosine = sample_two_lobe_cosine(u, *lobes)
+    return 1 - cosine, dr.rcp(two_lobe(cosine, *lobes))
+
+
+def _around(direction: Any, beside: Any, u_azimuth: Any) -> Any:
+    """Unit vectors around `direction`, given one minus the cosine of the angle between them and a number in [0, 1) for the azimuth."""
+    cos_a, sin_a = circle(u_azimuth)
+    return turned(direction, 1 - beside, dr.safe_sqrt(beside * (2 - beside)), cos_a, sin_a)
 
 
 @dr.syntax
@@ -207,7 +223,8 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
             rng, u_cosine = _uniform(types, rng)
             rng, u_azimuth = _uniform(types, rng)
             incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
-            direction = rotate_to(incoming, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
+            beside, _ = _sample(lobes, u_cosine)
+            direction = _around(incoming, beside, u_azimuth)
             origin = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.points))
             enter, leave = field.intersect(origin, direction)
             # A ray that misses the box starts far beyond it, and so escapes at its first step.
@@ -233,12 +250,12 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
         rng, u_step = _uniform(types, rng)
         rng, u_event = _uniform(types, rng)
         along = field.direction_to_unit(heading)
-        distance, tentative, majorant = field.majorants.step(position, along, distance, u_step, traced)
+        distance, tentative, mean_path = field.majorants.step(position, along, distance, u_step, traced)
         unit = dr.fma(along, distance, position)
         inside = traced & field.holds_unit(unit)
         rng, thirds = _three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
-        hit = inside & tentative & (u_event * majorant < sigma)
+        hit = inside & tentative & (u_event < sigma * mean_path)
 
         collision = hit & ~shadow
         connected = traced & shadow & ~inside
@@ -249,8 +266,8 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
             dr.scatter_add(result, value * weight[m], first + m, connected, mode=dr.ReduceMode.NoConflicts)
         pending = dr.select(connected | (shadow & hit), pending & ~lowest, pending)
 
-        # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connections.
-        u_connect = u_event * majorant / sigma
+        # Given a collision, u_event is uniform below sigma * mean_path: stretched, it decides the roulette of the connections.
+        u_connect = u_event / (sigma * mean_path)
         chosen = UInt32(0)
         for k in range(k_suns):
             u_k = u_connect + 0.6180339887 * k
@@ -263,7 +280,8 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
         turn = (pending == 0) & (collision | (shadow & (connected | hit)))
         rng, u_cosine = _uniform(types, rng)
         rng, u_azimuth = _uniform(types, rng)
-        direction = dr.select(turn, rotate_to(direction, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth), direction)
+        beside, _ = _sample(lobes, u_cosine)
+        direction = dr.select(turn, _around(direction, beside, u_azimuth), direction)
         for m in range(m_albedos):
             weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
         ended |= traced & ~inside & ~shadow

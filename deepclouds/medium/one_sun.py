@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _Job, _phase, _Queries, _sample_cosine, _stream, _thinned, _three_uniform, _uniform
-from deepclouds.medium.phase import as_lobes, rotate_to
+from deepclouds.medium.multiple_scattering import _TURN, _around, _inverse, _Job, _Queries, _sample, _stream, _thinned, _three_uniform, _uniform
+from deepclouds.medium.phase import as_lobes
 
 # World points and unit vectors (Array3f) and which lanes ask -> Float, infinite where nothing is met.
 Ends = Callable[[Any, Any, Any], Any]
@@ -196,8 +196,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     landing = dr.zeros(Array3f, lanes)  # of the side branch, likewise
     direction = dr.zeros(Array3f, lanes)  # of the walk, world
     side = dr.zeros(Array3f, lanes)  # of the side branch, world
-    density = dr.zeros(Float, lanes)  # with which `direction` was drawn, 1/sr
-    rival = dr.zeros(Float, lanes)  # 1, or 0 where no side branch competes
+    rivalry = dr.zeros(Float, lanes)  # 1 over the density with which `direction` was drawn, sr; 0 where no side branch competes
     distance = dr.zeros(Float, lanes)  # along the current segment, world units
     value = dr.zeros(Float, lanes)  # of the connection or branch that is followed up
     lobes = [dr.zeros(Float, lanes) for _ in queries.lobes]
@@ -256,14 +255,14 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             begun = alive & field.holds_unit(unit)
             rng, u_cosine = _uniform(types, rng)
             rng, u_azimuth = _uniform(types, rng)
-            ahead = rotate_to(incoming, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
+            beside, _ = _sample(lobes, u_cosine)
+            ahead = _around(incoming, beside, u_azimuth)
             enter, leave = field.intersect(origin, ahead)
             # From outside the walk begins where it enters; a ray that misses the box starts far beyond it, and so escapes at once.
             position = dr.select(begun, unit, dr.clip(field.to_unit(dr.fma(ahead, enter, origin)), 0, 1))
             distance = dr.select(begun | (leave > enter), 0, 1e32)
             direction = dr.select(begun, incoming, ahead)
-            density = Float(1)
-            rival = Float(0)
+            rivalry = Float(0)
             task = UInt32(_WALK)
             ended = Bool(False)
 
@@ -280,14 +279,14 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             fresh = traced & (distance == 0)
             if fresh:
                 reach = ends(field.to_world(start), heading, fresh)
-        distance, tentative, majorant = field.majorants.step(start, along, distance, u_step, traced)
+        distance, tentative, mean_path = field.majorants.step(start, along, distance, u_step, traced)
         unit = dr.fma(along, distance, start)
         inside = traced & field.holds_unit(unit)
         if ends is not None:
             inside &= distance < reach
         rng, thirds = _three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
-        hit = inside & tentative & (u_event * majorant < sigma)
+        hit = inside & tentative & (u_event < sigma * mean_path)
         gone = traced & ~inside
         over = hit | gone
 
@@ -303,8 +302,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         leaving = begun | collision
         branch, shadow, of_vertex = Bool(False), Bool(False), Float(0)
         if kind.sunlit:
-            toward_sun = _phase(lobes, dr.dot(direction, sun))
-            of_vertex = 4 * np.pi * toward_sun * density * dr.rcp(density + rival * toward_sun)
+            of_vertex = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, sun)) + rivalry)
             lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
             if ends is not None:
                 # Surfaces beyond the box shade as well.
@@ -323,8 +321,8 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                     vertex[i] = dr.select(chosen, place[i], vertex[i])
                 for m in range(m_albedos):
                     parts[m] = dr.select(chosen, arriving[m] / dr.maximum(here, 1e-30), parts[m])
-            # Given a collision, u_event is uniform below sigma / majorant: stretched, it decides the roulette of the connection.
-            shadow = collision & (u_event * majorant < sigma * (often * of_vertex))
+            # Given a collision, u_event is uniform below sigma * mean_path: stretched, it decides the roulette of the connection.
+            shadow = collision & (u_event < sigma * mean_path * (often * of_vertex))
             leaving = begun | (collision & ~shadow) | (over & (task == _SHADOW))
         if varying is None:
             for m in range(m_albedos):
@@ -334,9 +332,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             rng, u_cosine = _uniform(types, rng)
             rng, u_azimuth = _uniform(types, rng)
             rng, u_branch = _uniform(types, rng)
-            around = rotate_to(sun, _sample_cosine(lobes, u_cosine), 2 * np.pi * u_azimuth)
-            of_walk, of_sun = _phase(lobes, dr.dot(direction, around)), _phase(lobes, dr.dot(around, sun))
-            of_branch = 4 * np.pi * of_walk * of_sun * dr.rcp(of_walk + of_sun)
+            beside, of_sun = _sample(lobes, u_cosine)
+            around = _around(sun, beside, u_azimuth)
+            of_branch = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, around)) + of_sun)
             branch = leaving & (u_branch < often * of_branch)
             side = dr.select(branch, around, side)
             landing = dr.select(landed, unit, landing)
@@ -345,10 +343,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         turn = (leaving & ~branch) | (gone & (task == _BRANCH)) | (over & (task == _BRANCH_SHADOW))
         rng, u_cosine = _uniform(types, rng)
         rng, u_azimuth = _uniform(types, rng)
-        cosine = _sample_cosine(lobes, u_cosine)
-        direction = dr.select(turn, rotate_to(direction, cosine, 2 * np.pi * u_azimuth), direction)
-        density = dr.select(turn, _phase(lobes, cosine), density)
-        rival = dr.select(turn, 1, rival)
+        beside, of_walk = _sample(lobes, u_cosine)
+        direction = dr.select(turn, _around(direction, beside, u_azimuth), direction)
+        rivalry = dr.select(turn, of_walk, rivalry)
         left |= gone & walking if kind.straight else gone & walking & scattered
         ended |= gone & walking
         if job.roulette:

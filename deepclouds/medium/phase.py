@@ -32,15 +32,35 @@ def hg_numpy(cos_theta: ArrayLike, g: ArrayLike) -> NDArray[np.float64]:
     return value
 
 
+def inverse_hg(cos_theta: Any, g: Any) -> Any:
+    """The inverse of `hg`, sr, which costs no division where `g` is the same for all."""
+    import drjit as dr
+
+    a = dr.abs(g)
+    denominator = dr.fma(2 * a, 1 - dr.select(g < 0, -1.0, 1.0) * cos_theta, dr.square(1 - a))
+    return 4 * np.pi / ((1 - a) * (1 + a)) * (denominator * dr.sqrt(denominator))
+
+
+def sample_hg(u: Any, g: Any) -> tuple[Any, Any]:
+    """One minus the cosine of the scattering angle, by inversion of the cumulative HG density from `u` in [0, 1), and `inverse_hg` there.
+
+    With ``q = 1 - g + 2 g u`` the textbook's cosine ``(1 + g^2 - ((1 - g^2) / q)^2) / (2 g)`` is ``1 - (1 - g)^2 (1 - u) (1 + g + q) / q^2``,
+    which needs no other form near g = 0.
+    """
+    import drjit as dr
+
+    q = dr.fma(2 * g, u, 1 - g)
+    inverse = dr.rcp(q)
+    square = inverse * inverse
+    beside = dr.square(1 - g) * (1 - u) * ((1 + g) + q) * square
+    return beside, 4 * np.pi * dr.square((1 - g) * (1 + g)) * (square * inverse)
+
+
 def sample_hg_cosine(u: Any, g: Any) -> Any:
     """Cosine of the scattering angle by inversion of the cumulative HG density, from `u` in [0, 1)."""
     import drjit as dr
 
-    small = dr.abs(g) < 1e-3
-    safe = dr.select(small, 1e-3, g)
-    ratio = (1 - safe * safe) / (1 - safe + 2 * safe * u)
-    cosine = (1 + safe * safe - ratio * ratio) / (2 * safe)
-    return dr.clip(dr.select(small, 1 - 2 * u, cosine), -1, 1)
+    return dr.maximum(1 - sample_hg(u, g)[0], -1)
 
 
 def two_lobe(cos_theta: Any, g1: Any, g2: Any, weight: Any) -> Any:
@@ -97,11 +117,17 @@ def ordered_lobes(phase: tuple[float, float, float]) -> tuple[float, float, floa
 
 
 def rotate_to(direction: Any, cosine: Any, azimuth: Any) -> Any:
-    """Unit vectors at `cosine` and `azimuth` (radians) around the unit vectors `direction` (Duff et al. 2017, JCGT 6(1))."""
+    """Unit vectors at `cosine` and `azimuth` (radians) around the unit vectors `direction`."""
     import drjit as dr
 
-    sine = dr.safe_sqrt(1 - cosine * cosine)
     sin_a, cos_a = dr.sincos(azimuth)
+    return turned(direction, cosine, dr.safe_sqrt(1 - cosine * cosine), cos_a, sin_a)
+
+
+def turned(direction: Any, cosine: Any, sine: Any, cos_a: Any, sin_a: Any) -> Any:
+    """`rotate_to` for those who know sines and cosines (Duff et al. 2017, JCGT 6(1))."""
+    import drjit as dr
+
     x, y, z = direction
     sign = dr.select(z < 0, -1.0, 1.0)
     a = -dr.rcp(sign + z)
@@ -112,4 +138,5 @@ def rotate_to(direction: Any, cosine: Any, azimuth: Any) -> Any:
         u * sign * b + v * (sign + y * y * a) + cosine * y,
         u * (-sign * x) + v * (-y) + cosine * z,
     )
-    return dr.normalize(rotated)
+    # What is nearly of unit length already needs one step of Newton's, not a root.
+    return rotated * dr.fma(dr.squared_norm(rotated), -0.5, 1.5)
