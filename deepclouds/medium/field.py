@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, trilinear
+from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, PackedGrid, trilinear
 from deepclouds.medium.majorants import BRICK, Majorants
 from deepclouds.volume import SparseVolume, Volume
 
@@ -55,6 +55,7 @@ class Field:
         self.scale = float(scale)
         edges = np.linalg.norm(volume.to_world[:3, :3], axis=0)
         self.grid: Grid
+        self._packed: PackedGrid | None = None
         if isinstance(volume, SparseVolume):
             size = np.array(volume.resolution)
             self.majorants = Majorants(types, volume.bricks, edges / size, brick, self.scale)
@@ -70,6 +71,7 @@ class Field:
             size = np.array(sigma.shape[::-1])
             self.majorants = Majorants(types, sigma, edges / size, brick)
             self.grid = DenseGrid(types, sigma)
+            self._packed = PackedGrid(types, sigma)
             self.majorant, last = float(sigma.max()), size - 2
         inverse = np.linalg.inv(volume.to_world)
         self._to_unit = [[dr.opaque(types.Float, float(v)) for v in row] for row in inverse[:3]]
@@ -128,6 +130,8 @@ class Field:
         low, frac = self._cells(unit)
         one = self.types.UInt32(1)
         chosen = [self.types.UInt32(index) + dr.select(u < f, one, 0) for index, f, u in zip(low, frac, numbers, strict=True)]
+        if self._packed is not None:
+            return self._packed.at(chosen, active)
         return dr.gather(self.types.Float, self.grid.data, self.grid.place(chosen, active), active)
 
     def _cells(self, unit: Any) -> tuple[list[Any], list[Any]]:

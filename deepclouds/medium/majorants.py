@@ -23,6 +23,8 @@ BRICK = 4
 _BEYOND = 0.01
 # Stands for a majorant of 0 where it is divided by, 1 / world length.
 _LEAST = np.float32(1e-30)
+# Of a block's entry, the bits that hold its radius; the others are those of a float32, its mean free path cut by up to a 2048th.
+_RADIUS = 0xFFF
 # Mean distance from the centre of a cube of edge 1 to its surface.
 _MEAN_EXIT = 0.61
 
@@ -88,11 +90,10 @@ class Majorants:
         self.any_empty = bool(np.any(self.empty_radius >= 0))
         count = self.bound.shape[::-1]
         self._types = types
-        mean_path = 1 / np.maximum(self.block_bound, _LEAST)
-        self._table = lanes_of(types.Float, np.stack([mean_path, self.radius], axis=-1).ravel())
+        self._table = lanes_of(types.UInt32, _packed(self.block_bound, self.radius).ravel())
         self._empty = lanes_of(types.Float, self.empty_radius.ravel())
         kept = (self.bound, self.radius, self.block_bound, self.empty_radius)
-        self.nbytes = sum(a.nbytes for a in kept) + 4 * 3 * self.bound.size
+        self.nbytes = sum(a.nbytes for a in kept) + 4 * 2 * self.bound.size
         self._per_unit = [dr.opaque(types.Float, float(n / b)) for n, b in zip(shape, self.bricks, strict=True)]
         self._edge = [dr.opaque(types.Float, float(b / n)) for n, b in zip(shape, self.bricks, strict=True)]
         self._half = [dr.opaque(types.Float, float(0.5 * b / n)) for n, b in zip(shape, self.bricks, strict=True)]
@@ -124,8 +125,9 @@ class Majorants:
             mean free path in the block, world length: with probability ``sigma_t * mean_path`` the tentative collision is real.
         """
         cell, index = self._brick(dr.fma(along, distance, origin))
-        mean_path = dr.gather(self._types.Float, self._table, 2 * index, active)
-        radius = dr.gather(self._types.Float, self._table, 2 * index + 1, active)
+        packed = dr.gather(self._types.UInt32, self._table, index, active)
+        mean_path = dr.reinterpret_array(self._types.Float, packed & (0xFFFFFFFF ^ _RADIUS))
+        radius = self._types.Float(packed & _RADIUS)
         end = self._exit(cell, radius, origin, along)
         reached = dr.fma(-log_of_share(self._types, 1 - u), mean_path, distance)
         return dr.maximum(dr.minimum(reached, end), distance), reached < end, mean_path
@@ -170,6 +172,13 @@ def _brick_maxima(sigma: NDArray[np.float32], bricks: NDArray[Any]) -> NDArray[n
         after = np.take(bound, np.minimum(starts + n, bound.shape[axis] - 1), axis=axis)
         bound = np.maximum(here, np.maximum(before, after))
     return bound
+
+
+def _packed(bound: NDArray[np.float32], radius: NDArray[Any]) -> NDArray[np.uint32]:
+    """Mean free path and radius of each block in one number: what tracking waits for is memory."""
+    mean_path = 1 / np.maximum(bound, _LEAST)
+    bits: NDArray[np.uint32] = mean_path.view(np.uint32) & np.uint32(0xFFFFFFFF ^ _RADIUS) | radius.astype(np.uint32)
+    return bits
 
 
 def _choose_blocks(bound: NDArray[np.float32], edge: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[Any]]:

@@ -22,7 +22,7 @@ from deepclouds.medium.elementary import circle
 from deepclouds.medium.phase import as_lobes, hg, inverse_hg, sample_hg, sample_two_lobe_cosine, turned, two_lobe
 
 # Lanes begin walks at every so many steps.
-_TURN = 4
+_TURN = 8
 # Walks with less weight than this under every albedo go on with a chance, and then with this weight.
 _FAINT = 0.1
 

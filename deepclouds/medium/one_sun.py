@@ -286,6 +286,20 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             inside &= distance < reach
         rng, thirds = _three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
+        # Directions are drawn for all while memory is waited for.
+        rng, u_cosine = _uniform(types, rng)
+        rng, u_azimuth = _uniform(types, rng)
+        beside, of_walk = _sample(lobes, u_cosine)
+        onward = _around(direction, beside, u_azimuth)
+        of_vertex, of_branch, u_branch, around = Float(0), Float(0), Float(0), sun
+        if kind.sunlit:
+            of_vertex = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, sun)) + rivalry)
+            rng, u_cosine = _uniform(types, rng)
+            rng, u_azimuth = _uniform(types, rng)
+            rng, u_branch = _uniform(types, rng)
+            beside, of_sun = _sample(lobes, u_cosine)
+            around = _around(sun, beside, u_azimuth)
+            of_branch = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, around)) + of_sun)
         hit = inside & tentative & (u_event < sigma * mean_path)
         gone = traced & ~inside
         over = hit | gone
@@ -300,9 +314,8 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                 of_branch_end[m] = dr.select(landed, here[m], of_branch_end[m])
         position = dr.select(collision, unit, position)
         leaving = begun | collision
-        branch, shadow, of_vertex = Bool(False), Bool(False), Float(0)
+        branch, shadow = Bool(False), Bool(False)
         if kind.sunlit:
-            of_vertex = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, sun)) + rivalry)
             lit = gone & ((task == _SHADOW) | (task == _BRANCH_SHADOW))
             if ends is not None:
                 # Surfaces beyond the box shade as well.
@@ -329,22 +342,13 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                 weight[m] = dr.select(leaving & ~begun, weight[m] * albedo[m], weight[m])
         if kind.sunlit:
             # Once a vertex is dealt with, light of the next order may come by a side branch.
-            rng, u_cosine = _uniform(types, rng)
-            rng, u_azimuth = _uniform(types, rng)
-            rng, u_branch = _uniform(types, rng)
-            beside, of_sun = _sample(lobes, u_cosine)
-            around = _around(sun, beside, u_azimuth)
-            of_branch = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, around)) + of_sun)
             branch = leaving & (u_branch < often * of_branch)
             side = dr.select(branch, around, side)
             landing = dr.select(landed, unit, landing)
             value = dr.select(shadow, dr.maximum(of_vertex, least), dr.select(branch, dr.maximum(of_branch, least), value))
 
         turn = (leaving & ~branch) | (gone & (task == _BRANCH)) | (over & (task == _BRANCH_SHADOW))
-        rng, u_cosine = _uniform(types, rng)
-        rng, u_azimuth = _uniform(types, rng)
-        beside, of_walk = _sample(lobes, u_cosine)
-        direction = dr.select(turn, _around(direction, beside, u_azimuth), direction)
+        direction = dr.select(turn, onward, direction)
         rivalry = dr.select(turn, of_walk, rivalry)
         left |= gone & walking if kind.straight else gone & walking & scattered
         ended |= gone & walking
