@@ -58,9 +58,9 @@ def _track(field: Field, origin: Any, direction: Any, rng: Any) -> tuple[Any, An
     distance = dr.zeros(types.Float, dr.width(enter))
     hit = dr.zeros(types.Bool, dr.width(enter))
     while going:
-        distance, tentative, majorant = field.majorants.step(start, along, distance, rng.next_float32(), going)
+        distance, tentative, mean_path = field.majorants.step(start, along, distance, rng.next_float32(), going)
         unit = dr.fma(along, distance, start)
         inside = field.holds_unit(unit)
-        hit = inside & tentative & (rng.next_float32() * majorant < field.sigma_t_unit(unit, inside & tentative))
+        hit = inside & tentative & (rng.next_float32() < field.sigma_t_unit(unit, inside & tentative) * mean_path)
         going = inside & ~hit
     return enter + distance, hit

@@ -177,7 +177,7 @@ def _brick_maxima(sigma: NDArray[np.float32], bricks: NDArray[Any]) -> NDArray[n
 def _packed(bound: NDArray[np.float32], radius: NDArray[Any]) -> NDArray[np.uint32]:
     """Mean free path and radius of each block in one number: what tracking waits for is memory."""
     mean_path = 1 / np.maximum(bound, _LEAST)
-    bits: NDArray[np.uint32] = mean_path.view(np.uint32) & np.uint32(0xFFFFFFFF ^ _RADIUS) | radius.astype(np.uint32)
+    bits: NDArray[np.uint32] = mean_path.view(np.uint32) & np.uint32(0xFFFFFFFF ^ _RADIUS) | np.minimum(radius, _RADIUS).astype(np.uint32)
     return bits
 
 
