@@ -100,12 +100,16 @@ class _Queries:
         def upload(values: Any) -> Any:
             return lanes_of(types.Float, values)
 
+        def upload_or_one(values: Any) -> Any:
+            return dr.opaque(types.Float, float(values[0])) if np.all(values == values[0]) else upload(values)
+
         self.points = [upload(points[:, c]) for c in range(3)]
         self.directions = [upload(directions[:, c]) for c in range(3)]
         # A second lobe doubles the cost of a connection: it is left out, with the same result, where no point has one.
-        self.lobes = [upload(lobes[:, c]) for c in range(1 if np.all(lobes[:, 2] == 1) else 3)]
-        self.suns = [[upload(suns[:, k, c]) for c in range(3)] for k in range(suns.shape[1])]
-        self.albedos = [upload(albedos[:, m]) for m in range(albedos.shape[1])]
+        # What is the same for all walks is one number, which no lane has to remember.
+        self.lobes = [upload_or_one(lobes[:, c]) for c in range(1 if np.all(lobes[:, 2] == 1) else 3)]
+        self.suns = [[upload_or_one(suns[:, k, c]) for c in range(3)] for k in range(suns.shape[1])]
+        self.albedos = [upload_or_one(albedos[:, m]) for m in range(albedos.shape[1])]
         dr.eval(self.points, self.directions, self.lobes, self.suns, self.albedos)
 
 
@@ -184,6 +188,11 @@ def _around(direction: Any, beside: Any, u_azimuth: Any) -> Any:
     return turned(direction, 1 - beside, dr.safe_sqrt(beside * (2 - beside)), cos_a, sin_a)
 
 
+def _remembered(values: Any, lanes: int) -> Any:
+    """Room for what each lane takes from `values` with each walk; the one value where there is only one."""
+    return dr.zeros(type(values), lanes) if dr.width(values) > 1 else values
+
+
 @dr.syntax
 def _loop(field: Field, queries: _Queries, job: _Job) -> None:
     types = field.types
@@ -202,10 +211,10 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
     position = dr.zeros(Array3f, lanes)  # of the last collision, in the unit cube of the box
     direction = dr.zeros(Array3f, lanes)  # of the walk, world
     distance = dr.zeros(Float, lanes)  # along the current segment, world units
-    lobes = [dr.zeros(Float, lanes) for _ in queries.lobes]
+    lobes = [_remembered(a, lanes) for a in queries.lobes]
     pending = dr.zeros(UInt32, lanes)  # bit k: the connection to sun k is still to be traced
-    suns = [dr.zeros(Array3f, lanes) for _ in range(k_suns)]
-    albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
+    suns = [Array3f(*(_remembered(a, lanes) for a in sun)) for sun in queries.suns]
+    albedo = [_remembered(a, lanes) for a in queries.albedos]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
 
     clock = dr.zeros(UInt32, lanes)
@@ -219,7 +228,8 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
             point = number // walks_each
             rng = _stream(types, key, number)
             for i in range(len(lobes)):
-                lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
+                if dr.width(queries.lobes[i]) > 1:
+                    lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
             rng, u_cosine = _uniform(types, rng)
             rng, u_azimuth = _uniform(types, rng)
             incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
@@ -231,9 +241,12 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
             position = dr.clip(field.to_unit(dr.fma(direction, enter, origin)), 0, 1)
             distance = dr.select(leave > enter, 0, 1e32)
             for k in range(k_suns):
-                suns[k] = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.suns[k]))
+                for c in range(3):
+                    if dr.width(queries.suns[k][c]) > 1:
+                        suns[k][c] = dr.gather(Float, queries.suns[k][c], point, alive)
             for m in range(m_albedos):
-                albedo[m] = dr.gather(Float, queries.albedos[m], point, alive)
+                if dr.width(queries.albedos[m]) > 1:
+                    albedo[m] = dr.gather(Float, queries.albedos[m], point, alive)
                 weight[m] = Float(1)
             pending = UInt32(0)
             ended = Bool(False)

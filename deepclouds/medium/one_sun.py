@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _around, _inverse, _Job, _Queries, _sample, _stream, _thinned, _three_uniform, _uniform
+from deepclouds.medium.multiple_scattering import _TURN, _around, _inverse, _Job, _Queries, _remembered, _sample, _stream, _thinned, _three_uniform, _uniform
 from deepclouds.medium.phase import as_lobes
 
 # World points and unit vectors (Array3f) and which lanes ask -> Float, infinite where nothing is met.
@@ -199,9 +199,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     rivalry = dr.zeros(Float, lanes)  # 1 over the density with which `direction` was drawn, sr; 0 where no side branch competes
     distance = dr.zeros(Float, lanes)  # along the current segment, world units
     value = dr.zeros(Float, lanes)  # of the connection or branch that is followed up
-    lobes = [dr.zeros(Float, lanes) for _ in queries.lobes]
-    sun = dr.zeros(Array3f, lanes)
-    albedo = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
+    lobes = [_remembered(a, lanes) for a in queries.lobes]
+    sun = Array3f(*(_remembered(a, lanes) for a in queries.suns[0]))
+    albedo = [_remembered(a, lanes) for a in queries.albedos]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
     found = [dr.zeros(Float, lanes) for _ in range(m_albedos)]  # of the walk so far
     # Albedo where a branch has landed, if it varies; else the weight has it already.
@@ -244,12 +244,16 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             point = number // walks_each
             rng = _stream(types, key, number)
             for i in range(len(lobes)):
-                lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
+                if dr.width(queries.lobes[i]) > 1:
+                    lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
             incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
             origin = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.points))
-            sun = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.suns[0]))
+            for c in range(3):
+                if dr.width(queries.suns[0][c]) > 1:
+                    sun[c] = dr.gather(Float, queries.suns[0][c], point, alive)
             for m in range(m_albedos):
-                albedo[m] = dr.gather(Float, queries.albedos[m], point, alive)
+                if dr.width(queries.albedos[m]) > 1:
+                    albedo[m] = dr.gather(Float, queries.albedos[m], point, alive)
                 weight[m] = Float(1)
             unit = field.to_unit(origin)
             begun = alive & field.holds_unit(unit)
