@@ -32,6 +32,11 @@ def log_of_share(types: ModuleType, v: Any) -> Any:
     return dr.fma(types.Float(exponent), _LOG_OF_2, rest * _polynomial(_LOG, rest))
 
 
+def whole(types: ModuleType, value: Any) -> Any:
+    """A Float from 0 to 2^31 as a UInt32, rounded down: by way of signed numbers, which processors know how to convert."""
+    return types.UInt32(types.Int32(value))
+
+
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
     total = dr.fma(x, coefficients[-1], coefficients[-2])
     for coefficient in coefficients[-3::-1]:

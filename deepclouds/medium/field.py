@@ -8,7 +8,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, PackedGrid, trilinear
+from deepclouds.medium.elementary import whole
+from deepclouds.medium.grid import BrickGrid, DenseGrid, Grid, trilinear
 from deepclouds.medium.majorants import BRICK, Majorants
 from deepclouds.volume import SparseVolume, Volume
 
@@ -55,7 +56,6 @@ class Field:
         self.scale = float(scale)
         edges = np.linalg.norm(volume.to_world[:3, :3], axis=0)
         self.grid: Grid
-        self._packed: PackedGrid | None = None
         if isinstance(volume, SparseVolume):
             size = np.array(volume.resolution)
             self.majorants = Majorants(types, volume.bricks, edges / size, brick, self.scale)
@@ -71,7 +71,6 @@ class Field:
             size = np.array(sigma.shape[::-1])
             self.majorants = Majorants(types, sigma, edges / size, brick)
             self.grid = DenseGrid(types, sigma)
-            self._packed = PackedGrid(types, sigma)
             self.majorant, last = float(sigma.max()), size - 2
         inverse = np.linalg.inv(volume.to_world)
         self._to_unit = [[dr.opaque(types.Float, float(v)) for v in row] for row in inverse[:3]]
@@ -110,7 +109,7 @@ class Field:
         """Extinction at points given in the unit cube of the box."""
         inside = active & self.holds_unit(unit)
         low, frac = self._cells(unit)
-        return trilinear(self.grid, [self.types.UInt32(index) for index in low], frac, inside)
+        return trilinear(self.grid, [whole(self.types, index) for index in low], frac, inside)
 
     def drawn_unit(self, unit: Any, numbers: list[Any], active: Any = True) -> Any:
         """One of the eight samples around points of the unit cube, drawn by the weights that interpolation gives them.
@@ -129,9 +128,7 @@ class Field:
         """
         low, frac = self._cells(unit)
         one = self.types.UInt32(1)
-        chosen = [self.types.UInt32(index) + dr.select(u < f, one, 0) for index, f, u in zip(low, frac, numbers, strict=True)]
-        if self._packed is not None:
-            return self._packed.at(chosen, active)
+        chosen = [whole(self.types, index) + dr.select(u < f, one, 0) for index, f, u in zip(low, frac, numbers, strict=True)]
         return dr.gather(self.types.Float, self.grid.data, self.grid.place(chosen, active), active)
 
     def _cells(self, unit: Any) -> tuple[list[Any], list[Any]]:

@@ -16,8 +16,6 @@ from deepclouds.volume.bricks import BRICK_VOXELS, EDGE, Bricks
 # A brick on the device has one sample more along each axis, the first of its neighbour: eight corners never need a second brick.
 _WIDE = EDGE + 1
 _WIDE_VOXELS = _WIDE**3
-# Largest number that a packed sample holds, and the samples of a block along z, y and x.
-_PACKED, _PACKED_BLOCK = 0xFFFF, (2, 4, 4)
 # Indices are 32-bit numbers, and so are the sizes of arrays.
 _MOST = 2**32 - 1
 
@@ -102,48 +100,6 @@ class BrickGrid:
         brick = dr.gather(self.types.UInt32, self._table, x + y * self._row + z * self._plane, active)
         x, y, z = (v & (EDGE - 1) for v in low)
         return brick + x + y * _WIDE + z * _WIDE**2
-
-
-class PackedGrid:
-    """Samples of 16 bits in blocks of 4 x 4 x 2, each a line of the cache: for those who look up one at a time, here and there.
-
-    Parameters
-    ----------
-    types
-        ``drjit.llvm`` or ``drjit.cuda``.
-    values
-        float32 (nz, ny, nx), not negative. They are rounded up or down to a 65535th of the largest by chance, so that no place is thicker or
-        thinner for it on the mean, however thin it is.
-
-    Attributes
-    ----------
-    nbytes
-        of the samples.
-    """
-
-    def __init__(self, types: ModuleType, values: NDArray[np.float32]) -> None:
-        self._types = types
-        most = float(values.max(initial=0.0))
-        self._unit = dr.opaque(types.Float, most / _PACKED)
-        random = np.random.default_rng(0)
-        blocks = tuple(-(-n // b) for n, b in zip(values.shape, _PACKED_BLOCK, strict=True))
-        whole = np.zeros(tuple(n * b for n, b in zip(blocks, _PACKED_BLOCK, strict=True)), np.uint16)
-        per_unit = np.float32(_PACKED / most if most > 0 else 0)
-        for plane, packed in zip(values, whole, strict=False):
-            rounded = np.minimum(plane * per_unit + random.random(plane.shape, np.float32), np.float32(_PACKED))
-            packed[: plane.shape[0], : plane.shape[1]] = rounded.astype(np.uint16)
-        dz, dy, dx = _PACKED_BLOCK
-        in_blocks = whole.reshape(blocks[0], dz, blocks[1], dy, blocks[2], dx).transpose(0, 2, 4, 1, 3, 5)
-        self._data = lanes_of(types.UInt32, np.ascontiguousarray(in_blocks).ravel().view("<u4"))
-        self._row, self._plane = dr.opaque(types.UInt32, 16 * blocks[2]), dr.opaque(types.UInt32, 16 * blocks[2] * blocks[1])
-        self.nbytes = whole.nbytes
-
-    def at(self, index: list[Any], active: Any) -> Any:
-        """The samples at indices (UInt32), x first; 0 for inactive lanes."""
-        x, y, z = index
-        block = ((x >> 2) << 4) + (y >> 2) * self._row + (z >> 1) * self._plane
-        word = dr.gather(self._types.UInt32, self._data, block + ((x >> 1) & 1) + ((y & 3) << 1) + ((z & 1) << 3), active)
-        return self._types.Float((word >> ((x & 1) << 4)) & _PACKED) * self._unit
 
 
 Grid = DenseGrid | BrickGrid

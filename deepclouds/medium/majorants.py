@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of
-from deepclouds.medium.elementary import log_of_share
+from deepclouds.medium.elementary import log_of_share, whole
 from deepclouds.volume.bricks import EDGE, Bricks
 
 # Edge of a brick, in voxels of the smallest edge.
@@ -145,7 +145,7 @@ class Majorants:
 
     def _brick(self, at: Any) -> tuple[list[Any], Any]:
         cell = [dr.clip(dr.floor(v * n), 0, last) for v, n, last in zip(at, self._per_unit, self._last, strict=True)]
-        index = [self._types.UInt32(c) for c in cell]
+        index = [whole(self._types, c) for c in cell]
         return cell, index[0] + index[1] * self._stride_y + index[2] * self._stride_z
 
     def _exit(self, cell: list[Any], radius: Any, origin: Any, along: Any) -> Any:

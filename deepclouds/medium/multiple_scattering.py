@@ -139,6 +139,12 @@ def _bits(rng: list[Any]) -> tuple[list[Any], Any]:
     return [s0, s1], bits
 
 
+def _two_uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any, Any]:
+    """The next state and two numbers of 16 bits each, in the middle of their intervals."""
+    rng, bits = _bits(rng)
+    return rng, *((types.Float(part) + 0.5) * (1.0 / 65536.0) for part in (bits >> 16, bits & 0xFFFF))
+
+
 def _three_uniform(types: Any, rng: list[Any]) -> tuple[list[Any], list[Any]]:
     """The next state and three numbers of ten bits each, in the middle of their intervals: for choices that need no more."""
     rng, bits = _bits(rng)
@@ -230,8 +236,7 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
             for i in range(len(lobes)):
                 if dr.width(queries.lobes[i]) > 1:
                     lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
-            rng, u_cosine = _uniform(types, rng)
-            rng, u_azimuth = _uniform(types, rng)
+            rng, u_cosine, u_azimuth = _two_uniform(types, rng)
             incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
             beside, _ = _sample(lobes, u_cosine)
             direction = _around(incoming, beside, u_azimuth)
@@ -291,8 +296,7 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
         distance = dr.select(collision | connected | (shadow & hit), 0, distance)
 
         turn = (pending == 0) & (collision | (shadow & (connected | hit)))
-        rng, u_cosine = _uniform(types, rng)
-        rng, u_azimuth = _uniform(types, rng)
+        rng, u_cosine, u_azimuth = _two_uniform(types, rng)
         beside, _ = _sample(lobes, u_cosine)
         direction = dr.select(turn, _around(direction, beside, u_azimuth), direction)
         for m in range(m_albedos):

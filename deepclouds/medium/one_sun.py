@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _around, _inverse, _Job, _Queries, _remembered, _sample, _stream, _thinned, _three_uniform, _uniform
+from deepclouds.medium.multiple_scattering import _TURN, _around, _inverse, _Job, _Queries, _remembered, _sample, _stream, _thinned, _three_uniform, _two_uniform, _uniform
 from deepclouds.medium.phase import as_lobes
 
 # World points and unit vectors (Array3f) and which lanes ask -> Float, infinite where nothing is met.
@@ -257,8 +257,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                 weight[m] = Float(1)
             unit = field.to_unit(origin)
             begun = alive & field.holds_unit(unit)
-            rng, u_cosine = _uniform(types, rng)
-            rng, u_azimuth = _uniform(types, rng)
+            rng, u_cosine, u_azimuth = _two_uniform(types, rng)
             beside, _ = _sample(lobes, u_cosine)
             ahead = _around(incoming, beside, u_azimuth)
             enter, leave = field.intersect(origin, ahead)
@@ -291,15 +290,13 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         rng, thirds = _three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
         # Directions are drawn for all while memory is waited for.
-        rng, u_cosine = _uniform(types, rng)
-        rng, u_azimuth = _uniform(types, rng)
+        rng, u_cosine, u_azimuth = _two_uniform(types, rng)
         beside, of_walk = _sample(lobes, u_cosine)
         onward = _around(direction, beside, u_azimuth)
         of_vertex, of_branch, u_branch, around = Float(0), Float(0), Float(0), sun
         if kind.sunlit:
             of_vertex = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, sun)) + rivalry)
-            rng, u_cosine = _uniform(types, rng)
-            rng, u_azimuth = _uniform(types, rng)
+            rng, u_cosine, u_azimuth = _two_uniform(types, rng)
             rng, u_branch = _uniform(types, rng)
             beside, of_sun = _sample(lobes, u_cosine)
             around = _around(sun, beside, u_azimuth)
