@@ -101,7 +101,7 @@ def trace_one_sun(
     return np.array(job.result).reshape(n, walks, m_albedos)
 
 
-def trace_to_escape(
+def begin_to_escape(
     field: Field,
     points: NDArray[np.float32],
     directions: NDArray[np.float32],
@@ -115,8 +115,8 @@ def trace_to_escape(
     shaded: bool = False,
     ends: Ends | None = None,
     straight: bool = False,
-) -> tuple[NDArray[np.float32], Escapes]:
-    """Walks, one a point, under one sun or none, and where they leave the cloud: there each sees light from all around.
+) -> tuple[Any, Escapes]:
+    """Set off walks, one a point, under one sun or none, to where they leave the cloud: there each sees light from all around.
 
     Parameters
     ----------
@@ -138,14 +138,14 @@ def trace_to_escape(
 
     Returns
     -------
-    float32 array (n, m) as of `trace_one_sun`, of zeros without a sun; and the escapes.
+    Float, n rows of m numbers as of `trace_one_sun`, of zeros without a sun; and the escapes. Whoever reads either waits for the walks.
     """
     if varying is not None:
         albedos = np.ones((len(points), varying.channels), np.float32)
     n, m_albedos = len(points), albedos.shape[1]
     types = field.types
     if n == 0 or field.majorant == 0.0:
-        return np.zeros((n, m_albedos), np.float32), Escapes(types, n, m_albedos)
+        return dr.zeros(types.Float, n * m_albedos), Escapes(types, n, m_albedos)
     if n * m_albedos >= 2**31:
         raise ValueError(f"{n} walks at once need more than 2^31 results: trace fewer points a call")
     toward = np.broadcast_to(np.array([0, 0, 1], np.float32), (n, 3)) if suns is None else suns
@@ -156,7 +156,23 @@ def trace_to_escape(
         varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None, ends, straight
     )
     _loop(field, _Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
-    return np.array(job.result).reshape(n, m_albedos), escapes
+    dr.eval(job.result, escapes.position, escapes.direction, escapes.weight, escapes.sunlit, escapes.collided)
+    return job.result, escapes
+
+
+def trace_to_escape(
+    field: Field,
+    points: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    phase: NDArray[np.float32],
+    suns: NDArray[np.float32] | None,
+    albedos: NDArray[np.float32],
+    seed: int,
+    **how: Any,
+) -> tuple[NDArray[np.float32], Escapes]:
+    """The same, done: float32 array (n, m) and the escapes."""
+    result, escapes = begin_to_escape(field, points, directions, phase, suns, albedos, seed, **how)
+    return np.array(result).reshape(len(points), len(escapes.weight)), escapes
 
 
 class _Kind:

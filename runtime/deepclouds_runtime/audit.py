@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from deepclouds_runtime.audit_walks import Batch, Rays, Walks
+from deepclouds_runtime.audit_walks import AT_ONCE, Batch, Begun, Rays, Walks
 from deepclouds_runtime.camera import Window
 from deepclouds_runtime.correction import FLOOR, Correction, Sums
 from deepclouds_runtime.frame_source import FrameSource
@@ -91,6 +91,7 @@ class Audit:
         self._looked_at: list[tuple[Array, Array, Array, Array]] = []
         self._side = max(1, math.ceil(max(window.width, window.height) / _REGIONS))
         self._area = np.bincount(self._region(window.pixels(np.arange(window.count)))) * (window.share / window.count)
+        self._begun: Begun | None = None
         self.count = 0
 
     def _region(self, pixels: Array) -> Array:
@@ -100,9 +101,22 @@ class Audit:
         return region
 
     def extend(self, walks: int) -> None:
-        """Trace `walks` more walks, a fourth of them for each group; the first two groups are one half, the others the other."""
-        for batch in self._walks.batches(walks):
-            self._add(batch)
+        """Trace `walks` more walks, a fourth of them for each group; the first two groups are one half, the others the other.
+
+        The last of them are still on their way when it returns: what was found before is added up meanwhile.
+        """
+        while walks > 0:
+            begun = self._walks.begin(min(walks, AT_ONCE))
+            walks -= AT_ONCE
+            self._settle()
+            self._begun = begun
+            self.count += begun.count if begun else 0
+
+    def _settle(self) -> None:
+        """Wait for the walks that are on their way."""
+        if self._begun is not None:
+            self._add(self._begun.finish())
+            self._begun = None
 
     def _add(self, batch: Batch) -> None:
         predicted, walked = batch.predicted, batch.walked
@@ -129,7 +143,6 @@ class Audit:
         self._number += np.bincount(half, minlength=2)
         together = weights * (predicted - walked).sum(axis=1)
         self._moments += together.sum(), np.square(together).sum()
-        self.count += len(weights)
         if sum(len(points) for points, *_ in self._looked_at) < _LOOKED_AT:
             few = slice(0, None, max(1, len(weights) // _LOOKED_AT))
             self._looked_at.append((batch.points[few], weights[few], predicted[few], region[few]))
@@ -141,15 +154,18 @@ class Audit:
 
     def before(self) -> RegionError:
         """Error of what is audited."""
+        self._settle()
         return self._judged(None)
 
     def correction(self) -> Correction:
         """The correction that all walks ask for."""
+        self._settle()
         assert self._sums is not None
         return Correction(self._sums)
 
     def remaining(self) -> RegionError:
         """Error that a correction leaves: each half is corrected with what the other half says. That of all walks leaves less."""
+        self._settle()
         assert self._sums is not None
         return self._judged([self._step(Correction(self._sums, halves)) for halves in (((2,), (3,)), ((0,), (1,)))])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +25,8 @@ Rays = Callable[[Any, Stratified], tuple[Any, Any, Any]]
 _DEPTHS, _WALKS_A_RAY, _LEAST_RAYS, _MOST_RAYS = 4, 8, 1 << 13, 1 << 19
 # Share of the rays that should meet the cloud; where fewer do, there are more of them.
 _MET = 0.2
-# Walks that are in memory together.
-_AT_ONCE = 1 << 18
+# Most walks that are set off together.
+AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,14 @@ class Batch:
     weights: Array
     predicted: Array
     walked: Array
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Walks on their way: how many, and what waits for them."""
+
+    count: int
+    finish: Callable[[], Batch]
 
 
 class Walks:
@@ -83,15 +91,11 @@ class Walks:
         #: J (n, channels) of one walk a point, see `LightWalks`.
         self.walked = LightWalks(cloud, lights)
 
-    def batches(self, walks: int) -> Iterator[Batch]:
-        """Trace `walks` walks, an even share for each group; batches share no random number. None where the camera sees no cloud."""
-        while walks > 0:
-            batch = self._batch(min(walks, _AT_ONCE))
-            walks -= _AT_ONCE
-            if batch is not None:
-                yield batch
+    def begin(self, walks: int) -> Begun | None:
+        """Set off `walks` walks, `AT_ONCE` at most, an even share for each group; no two calls share a random number.
 
-    def _batch(self, walks: int) -> Batch | None:
+        None where the camera sees no cloud.
+        """
         types = self._cloud.field.types
         (own,) = self._seed.spawn(1)
         random = np.random.default_rng(own)
@@ -128,8 +132,12 @@ class Walks:
             groups.append(np.full(each, group))
         which = np.concatenate(drawn)
         points, of_ray = seen.points[which], seen.rays[which]
-        walked = self.walked(points, along[of_ray], random)
-        return Batch(points, chosen[of_ray], np.concatenate(groups), np.concatenate(weights), predicted[which], walked)
+        walked = self.walked.begin(points, along[of_ray], random)
+
+        def finish() -> Batch:
+            return Batch(points, chosen[of_ray], np.concatenate(groups), np.concatenate(weights), predicted[which], walked())
+
+        return Begun(len(which), finish)
 
 
 def predicted_at(sources: Sequence[FrameSource], points: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import drjit as dr
@@ -11,7 +12,7 @@ import numpy as np
 from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.one_sun import Escapes, trace_to_escape
+from deepclouds.medium.one_sun import Escapes, begin_to_escape, trace_to_escape
 from deepclouds_runtime.lights import BrightPart, Environment, LightSource, Shade, on_host
 from deepclouds_runtime.octree import Array
 from deepclouds_runtime.scene_lights import Sun
@@ -62,24 +63,35 @@ class LightWalks:
 
         A walk is connected to one sun, which is drawn for it, and sees all other light where it leaves the cloud.
         """
+        return self.begin(points, along, random)()
+
+    def begin(self, points: Array, along: Array, random: np.random.Generator) -> Callable[[], Array]:
+        """Set the walks off: what it returns waits for them, and returns what a call of this object would."""
         n = len(points)
         key = int(random.integers(1 << 32))
         result = np.zeros((n, len(self._cloud.albedo)))
         if not any(self._cloud.albedo) or not (self._connected or self._lights.sources):
-            return result
+            return lambda: result
         power = np.array([light.power for light in self._connected])
         share = power / power.sum() if len(power) else np.ones(1)
         if len(share) == 1:
-            return self._of_one(points, along, self._connected[0] if self._connected else None, 1.0, key, random)
+            return self._begin_one(points, along, self._connected[0] if self._connected else None, 1.0, key, random)
         # As many walks for each as it has light, and no walk knows which are beside it.
         places = (random.permutation(n) + random.random()) / n
         which = np.minimum(np.searchsorted(np.cumsum(share), places, side="right"), len(share) - 1)
+        begun = []
         for number, of_light in enumerate(share):
             chosen = np.flatnonzero(which == number)
             if len(chosen):
                 light = self._connected[number] if self._connected else None
-                result[chosen] = self._of_one(points[chosen], along[chosen], light, float(of_light), key + number, random)
-        return result
+                begun.append((chosen, self._begin_one(points[chosen], along[chosen], light, float(of_light), key + number, random)))
+
+        def finish() -> Array:
+            for chosen, walked in begun:
+                result[chosen] = walked()
+            return result
+
+        return finish
 
     def collisions(self, points: Array, along: Array, random: np.random.Generator) -> float:
         """How often walks from world points (n, 3) seen along unit vectors (n, 3) collide on the mean, by one walk a point.
@@ -98,7 +110,9 @@ class LightWalks:
         most = _THINNED / (1 - brightest) if brightest < 1 else math.inf
         return float(np.minimum(count, most).mean())
 
-    def _of_one(self, points: Array, along: Array, light: _Connected | None, share: float, key: int, random: np.random.Generator) -> Array:
+    def _begin_one(
+        self, points: Array, along: Array, light: _Connected | None, share: float, key: int, random: np.random.Generator
+    ) -> Callable[[], Array]:
         """J (n, channels) of walks that are connected to `light`, a `share` of all."""
         cloud, types, n = self._cloud, self._cloud.field.types, len(points)
         shade = self._lights.shade
@@ -110,7 +124,7 @@ class LightWalks:
         else:
             albedos, column = (), list(range(len(cloud.albedo)))
         toward, arriving = (None, np.zeros((n, len(column)))) if light is None else light.arriving(types, n, random)
-        j, escapes = trace_to_escape(
+        found, escapes = begin_to_escape(
             cloud.field,
             points.astype(np.float32),
             along.astype(np.float32),
@@ -124,15 +138,21 @@ class LightWalks:
             ends=shade.reach if shade.inside else None,
             straight=bool(self._lights.smooth),
         )
-        if toward is not None and shade.surfaces is not None and not shade.inside:
-            arriving = arriving * self._unshaded(escapes.sunlit, toward)[:, None]
-        seen = self._seen(escapes, n, key)
-        result = np.zeros((n, len(column)))
-        for c, m in enumerate(column):
-            # The next collision's albedo is in the walk where it varies.
-            next_one = own[:, c] if cloud.varying is None else 1.0
-            result[:, c] = own[:, c] * (arriving[:, c] * next_one * j[:, m] / (4 * math.pi * share) + seen[m][:, c])
-        return result
+
+        def finish() -> Array:
+            j = np.array(found).reshape(n, -1)
+            light_there = arriving
+            if toward is not None and shade.surfaces is not None and not shade.inside:
+                light_there = arriving * self._unshaded(escapes.sunlit, toward)[:, None]
+            seen = self._seen(escapes, n, key)
+            result = np.zeros((n, len(column)))
+            for c, m in enumerate(column):
+                # The next collision's albedo is in the walk where it varies.
+                next_one = own[:, c] if cloud.varying is None else 1.0
+                result[:, c] = own[:, c] * (light_there[:, c] * next_one * j[:, m] / (4 * math.pi * share) + seen[m][:, c])
+            return result
+
+        return finish
 
     def _unshaded(self, unit: Any, toward: Array) -> Array:
         """Whether no surface stands between points, given in the unit cube of the box, and what lies toward (n, 3): (n,)."""
