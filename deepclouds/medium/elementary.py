@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -14,6 +15,8 @@ _MINUS_COSINE = (-0.99999995, 19.73917132, -64.93458165, 85.24010036, -56.240540
 _LOG = (0.999999943, -0.500003631, 0.333351141, -0.249700717, 0.19898565, -0.172470133, 0.162341898, -0.101340568)
 _ROOT_OF_HALF, _MANTISSA = 0x3F3504F3, 23
 _LOG_OF_2 = 0.6931471805599453
+# `value` or, where `sign` is negative, its opposite: (value, sign). Dr.Jit's, which has no types.
+with_sign: Callable[[Any, Any], Any] = dr.mulsign
 
 
 def circle(u: Any) -> tuple[Any, Any]:
@@ -21,14 +24,15 @@ def circle(u: Any) -> tuple[Any, Any]:
     x = u - 0.5
     y = dr.abs(x) - 0.25
     square = y * y
-    return y * _polynomial(_SINE, square), dr.mulsign(_polynomial(_MINUS_COSINE, square), x)
+    return y * _polynomial(_SINE, square), with_sign(_polynomial(_MINUS_COSINE, square), x)
 
 
 def log_of_share(types: ModuleType, v: Any) -> Any:
     """Natural logarithm of a Float from 1e-37 to 1, within 4e-7 of its value."""
-    bits = dr.reinterpret_array(types.Int32, v)
+    bits: Any = dr.reinterpret_array(types.Int32, v)
     exponent = (bits - _ROOT_OF_HALF) >> _MANTISSA
-    rest = dr.reinterpret_array(types.Float, bits - (exponent << _MANTISSA)) - 1
+    mantissa: Any = dr.reinterpret_array(types.Float, bits - (exponent << _MANTISSA))
+    rest = mantissa - 1
     return dr.fma(types.Float(exponent), _LOG_OF_2, rest * _polynomial(_LOG, rest))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.backend import lanes_of
-from deepclouds.medium.elementary import log_of_share, whole
+from deepclouds.medium.elementary import log_of_share, whole, with_sign
 from deepclouds.volume.bricks import EDGE, Bricks
 
 # Edge of a brick, in voxels of the smallest edge.
@@ -90,7 +90,7 @@ class Majorants:
         self.any_empty = bool(np.any(self.empty_radius >= 0))
         count = self.bound.shape[::-1]
         self._types = types
-        self._table = lanes_of(types.UInt32, _packed(self.block_bound, self.radius).ravel())
+        self._table = lanes_of(types.UInt32, packed(self.block_bound, self.radius).ravel())
         self._empty = lanes_of(types.Float, self.empty_radius.ravel())
         kept = (self.bound, self.radius, self.block_bound, self.empty_radius)
         self.nbytes = sum(a.nbytes for a in kept) + 4 * 2 * self.bound.size
@@ -150,9 +150,10 @@ class Majorants:
 
     def _exit(self, cell: list[Any], radius: Any, origin: Any, along: Any) -> Any:
         # On each axis the way to the middle of the block and half of its edge, over the speed; the least of the three by one division.
-        way, speed = None, None
+        way: Any = None
+        speed: Any = None
         for c, edge, half, beyond, o, a in zip(cell, self._edge, self._half, self._beyond, origin, along, strict=True):
-            own_way, own_speed = dr.fma(radius, edge, beyond) + dr.mulsign(dr.fma(c, edge, half) - o, a), dr.abs(a)
+            own_way, own_speed = dr.fma(radius, edge, beyond) + with_sign(dr.fma(c, edge, half) - o, a), dr.abs(a)
             if way is None:
                 way, speed = own_way, own_speed
                 continue
@@ -174,7 +175,7 @@ def _brick_maxima(sigma: NDArray[np.float32], bricks: NDArray[Any]) -> NDArray[n
     return bound
 
 
-def _packed(bound: NDArray[np.float32], radius: NDArray[Any]) -> NDArray[np.uint32]:
+def packed(bound: NDArray[np.float32], radius: NDArray[Any]) -> NDArray[np.uint32]:
     """Mean free path and radius of each block in one number: what tracking waits for is memory."""
     mean_path = 1 / np.maximum(bound, _LEAST)
     bits: NDArray[np.uint32] = mean_path.view(np.uint32) & np.uint32(0xFFFFFFFF ^ _RADIUS) | np.minimum(radius, _RADIUS).astype(np.uint32)

@@ -10,21 +10,26 @@ over a walk that leaves the point x in a direction drawn from the phase function
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.backend import lanes_of
 from deepclouds.medium.field import Field
-from deepclouds.medium.elementary import circle
-from deepclouds.medium.phase import as_lobes, hg, inverse_hg, sample_hg, sample_two_lobe_cosine, turned, two_lobe
-
-# Lanes begin walks at every so many steps.
-_TURN = 8
-# Walks with less weight than this under every albedo go on with a chance, and then with this weight.
-_FAINT = 0.1
+from deepclouds.medium.phase import as_lobes
+from deepclouds.medium.walk_parts import (
+    TURN,
+    Job,
+    Queries,
+    direction_around,
+    phase_value,
+    remembered,
+    sample_phase,
+    stream,
+    thinned,
+    three_uniform,
+    two_uniform,
+    uniform,
+)
 
 
 def trace_walks(
@@ -87,120 +92,14 @@ def trace_walks(
     if total * k_suns * m_albedos >= 2**31:
         raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
     types = field.types
-    queries = _Queries(types, points, directions, as_lobes(phase), suns, albedos)
-    job = _Job(types, walks, total, k_suns * m_albedos, seed, lanes, connect, roulette and bool(np.any(albedos < 1)))
+    queries = Queries(types, points, directions, as_lobes(phase), suns, albedos)
+    job = Job(types, walks, total, k_suns * m_albedos, seed, lanes, connect, roulette and bool(np.any(albedos < 1)))
     _loop(field, queries, job)
     return np.array(job.result).reshape(n, walks, k_suns, m_albedos)
 
 
-class _Queries:
-    """The arrays a walk starts from, on the device."""
-
-    def __init__(self, types: Any, points: Any, directions: Any, lobes: Any, suns: Any, albedos: Any) -> None:
-        def upload(values: Any) -> Any:
-            return lanes_of(types.Float, values)
-
-        def upload_or_one(values: Any) -> Any:
-            return dr.opaque(types.Float, float(values[0])) if np.all(values == values[0]) else upload(values)
-
-        self.points = [upload(points[:, c]) for c in range(3)]
-        self.directions = [upload(directions[:, c]) for c in range(3)]
-        # A second lobe doubles the cost of a connection: it is left out, with the same result, where no point has one.
-        # What is the same for all walks is one number, which no lane has to remember.
-        self.lobes = [upload_or_one(lobes[:, c]) for c in range(1 if np.all(lobes[:, 2] == 1) else 3)]
-        self.suns = [[upload_or_one(suns[:, k, c]) for c in range(3)] for k in range(suns.shape[1])]
-        self.albedos = [upload_or_one(albedos[:, m]) for m in range(albedos.shape[1])]
-        dr.eval(self.points, self.directions, self.lobes, self.suns, self.albedos)
-
-
-class _Job:
-    """How many walks a kernel traces, `total` in all with so many `results` each, and how; what they find, and the next one's number."""
-
-    def __init__(self, types: Any, walks: int, total: int, results: int, seed: int, lanes: int, connect: float, roulette: bool) -> None:
-        self.walks, self.total, self.lanes, self.connect, self.roulette = walks, total, min(lanes, total), connect, roulette
-        self.result = dr.zeros(types.Float, total * results)
-        self.counter = dr.zeros(types.UInt32, 1)
-        self.key = types.UInt64(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
-        dr.make_opaque(self.result, self.counter, self.key)
-
-
-def _uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any]:
-    """The next state and a number in [0, 1) of xoroshiro64* (Blackman and Vigna 2021), which needs 32-bit arithmetic alone."""
-    rng, bits = _bits(rng)
-    return rng, types.Float(bits >> 8) * (1.0 / 16777216.0)
-
-
-def _bits(rng: list[Any]) -> tuple[list[Any], Any]:
-    s0, s1 = rng
-    bits = s0 * 0x9E3779BB
-    s1 = s1 ^ s0
-    s0 = ((s0 << 26) | (s0 >> 6)) ^ s1 ^ (s1 << 9)
-    s1 = (s1 << 13) | (s1 >> 19)
-    return [s0, s1], bits
-
-
-def _two_uniform(types: Any, rng: list[Any]) -> tuple[list[Any], Any, Any]:
-    """The next state and two numbers of 16 bits each, in the middle of their intervals."""
-    rng, bits = _bits(rng)
-    return rng, *((types.Float(part) + 0.5) * (1.0 / 65536.0) for part in (bits >> 16, bits & 0xFFFF))
-
-
-def _three_uniform(types: Any, rng: list[Any]) -> tuple[list[Any], list[Any]]:
-    """The next state and three numbers of ten bits each, in the middle of their intervals: for choices that need no more."""
-    rng, bits = _bits(rng)
-    return rng, [(types.Float((bits >> shift) & 1023) + 0.5) * (1.0 / 1024.0) for shift in (22, 12, 2)]
-
-
-def _stream(types: Any, key: Any, number: Any) -> list[Any]:
-    """The starting state of the walk `number`: SplitMix64 of key and number (Steele et al. 2014)."""
-    z = key + types.UInt64(number) * 0x9E3779B97F4A7C15
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EB
-    z = z ^ (z >> 31)
-    return [types.UInt32(z & 0xFFFFFFFF) | 1, types.UInt32(z >> 32)]
-
-
-def _thinned(types: Any, rng: list[Any], weight: list[Any], active: Any) -> tuple[list[Any], Any, list[Any]]:
-    """Russian roulette of walks whose weights are all below `_FAINT`: the next random state, who is lost, and the weights of the others."""
-    heaviest = weight[0]
-    for value in weight[1:]:
-        heaviest = dr.maximum(heaviest, value)
-    faint = active & (heaviest < _FAINT)
-    rng, u = _uniform(types, rng)
-    gain = dr.select(faint, _FAINT / dr.maximum(heaviest, 1e-30), 1)
-    return rng, faint & (u * _FAINT >= heaviest), [value * gain for value in weight]
-
-
-def _phase(lobes: list[Any], cos_theta: Any) -> Any:
-    return hg(cos_theta, *lobes) if len(lobes) == 1 else two_lobe(cos_theta, *lobes)
-
-
-def _inverse(lobes: list[Any], cos_theta: Any) -> Any:
-    """One over the phase function, sr."""
-    return inverse_hg(cos_theta, *lobes) if len(lobes) == 1 else dr.rcp(two_lobe(cos_theta, *lobes))
-
-
-def _sample(lobes: list[Any], u: Any) -> tuple[Any, Any]:
-    """One minus the cosine of a scattering angle, and one over the phase function there, sr."""
-    if len(lobes) == 1:
-        return sample_hg(u, *lobes)
-    cosine = sample_two_lobe_cosine(u, *lobes)
-    return 1 - cosine, dr.rcp(two_lobe(cosine, *lobes))
-
-
-def _around(direction: Any, beside: Any, u_azimuth: Any) -> Any:
-    """Unit vectors around `direction`, given one minus the cosine of the angle between them and a number in [0, 1) for the azimuth."""
-    cos_a, sin_a = circle(u_azimuth)
-    return turned(direction, 1 - beside, dr.safe_sqrt(beside * (2 - beside)), cos_a, sin_a)
-
-
-def _remembered(values: Any, lanes: int) -> Any:
-    """Room for what each lane takes from `values` with each walk; the one value where there is only one."""
-    return dr.zeros(type(values), lanes) if dr.width(values) > 1 else values
-
-
 @dr.syntax
-def _loop(field: Field, queries: _Queries, job: _Job) -> None:
+def _loop(field: Field, queries: Queries, job: Job) -> None:
     types = field.types
     result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
     Float, UInt32, Bool, Array3f = types.Float, types.UInt32, types.Bool, types.Array3f
@@ -217,10 +116,10 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
     position = dr.zeros(Array3f, lanes)  # of the last collision, in the unit cube of the box
     direction = dr.zeros(Array3f, lanes)  # of the walk, world
     distance = dr.zeros(Float, lanes)  # along the current segment, world units
-    lobes = [_remembered(a, lanes) for a in queries.lobes]
+    lobes = [remembered(a, lanes) for a in queries.lobes]
     pending = dr.zeros(UInt32, lanes)  # bit k: the connection to sun k is still to be traced
-    suns = [Array3f(*(_remembered(a, lanes) for a in sun)) for sun in queries.suns]
-    albedo = [_remembered(a, lanes) for a in queries.albedos]
+    suns = [Array3f(*(remembered(a, lanes) for a in sun)) for sun in queries.suns]
+    albedo = [remembered(a, lanes) for a in queries.albedos]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
 
     clock = dr.zeros(UInt32, lanes)
@@ -228,18 +127,18 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
     while alive:
         # To take the next walk costs as much as several steps, and lanes run in step with each other: those that have ended wait for a
         # common turn. A lane retires when no walk is left.
-        if ended & (clock % _TURN == 0):
+        if ended & (clock % TURN == 0):
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
             point = number // walks_each
-            rng = _stream(types, key, number)
+            rng = stream(types, key, number)
             for i in range(len(lobes)):
                 if dr.width(queries.lobes[i]) > 1:
                     lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
-            rng, u_cosine, u_azimuth = _two_uniform(types, rng)
+            rng, u_cosine, u_azimuth = two_uniform(types, rng)
             incoming = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.directions))
-            beside, _ = _sample(lobes, u_cosine)
-            direction = _around(incoming, beside, u_azimuth)
+            beside, _ = sample_phase(lobes, u_cosine)
+            direction = direction_around(incoming, beside, u_azimuth)
             origin = Array3f(*(dr.gather(Float, a, point, alive) for a in queries.points))
             enter, leave = field.intersect(origin, direction)
             # A ray that misses the box starts far beyond it, and so escapes at its first step.
@@ -265,19 +164,19 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
             sun = dr.select(lowest == (1 << k), suns[k], sun)
         heading = dr.select(shadow, sun, direction)
 
-        rng, u_step = _uniform(types, rng)
-        rng, u_event = _uniform(types, rng)
+        rng, u_step = uniform(types, rng)
+        rng, u_event = uniform(types, rng)
         along = field.direction_to_unit(heading)
         distance, tentative, mean_path = field.majorants.step(position, along, distance, u_step, traced)
         unit = dr.fma(along, distance, position)
         inside = traced & field.holds_unit(unit)
-        rng, thirds = _three_uniform(types, rng)
+        rng, thirds = three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
         hit = inside & tentative & (u_event < sigma * mean_path)
 
         collision = hit & ~shadow
         connected = traced & shadow & ~inside
-        value = dr.select(connected, dr.maximum(4 * np.pi * _phase(lobes, dr.dot(direction, sun)), least), 0)
+        value = dr.select(connected, dr.maximum(4 * np.pi * phase_value(lobes, dr.dot(direction, sun)), least), 0)
         # A walk's results are its lane's alone.
         first = (number * k_suns + dr.popcnt(lowest - 1)) * m_albedos
         for m in range(m_albedos):
@@ -290,18 +189,18 @@ def _loop(field: Field, queries: _Queries, job: _Job) -> None:
         for k in range(k_suns):
             u_k = u_connect + 0.6180339887 * k
             u_k = u_k - dr.floor(u_k)
-            chosen |= dr.select(u_k < connect_4pi * _phase(lobes, dr.dot(direction, suns[k])), UInt32(1 << k), UInt32(0))
+            chosen |= dr.select(u_k < connect_4pi * phase_value(lobes, dr.dot(direction, suns[k])), UInt32(1 << k), UInt32(0))
         pending = dr.select(collision, chosen, pending)
         position = dr.select(collision, unit, position)
         distance = dr.select(collision | connected | (shadow & hit), 0, distance)
 
         turn = (pending == 0) & (collision | (shadow & (connected | hit)))
-        rng, u_cosine, u_azimuth = _two_uniform(types, rng)
-        beside, _ = _sample(lobes, u_cosine)
-        direction = dr.select(turn, _around(direction, beside, u_azimuth), direction)
+        rng, u_cosine, u_azimuth = two_uniform(types, rng)
+        beside, _ = sample_phase(lobes, u_cosine)
+        direction = dr.select(turn, direction_around(direction, beside, u_azimuth), direction)
         for m in range(m_albedos):
             weight[m] = dr.select(turn, weight[m] * albedo[m], weight[m])
         ended |= traced & ~inside & ~shadow
         if job.roulette:
-            rng, lost, weight = _thinned(types, rng, weight, turn)
+            rng, lost, weight = thinned(types, rng, weight, turn)
             ended |= lost

@@ -23,8 +23,21 @@ from numpy.typing import NDArray
 
 from deepclouds.medium.albedo import AlbedoField
 from deepclouds.medium.field import Field
-from deepclouds.medium.multiple_scattering import _TURN, _around, _inverse, _Job, _Queries, _remembered, _sample, _stream, _thinned, _three_uniform, _two_uniform, _uniform
 from deepclouds.medium.phase import as_lobes
+from deepclouds.medium.walk_parts import (
+    TURN,
+    Job,
+    Queries,
+    direction_around,
+    inverse_phase,
+    remembered,
+    sample_phase,
+    stream,
+    thinned,
+    three_uniform,
+    two_uniform,
+    uniform,
+)
 
 # World points and unit vectors (Array3f) and which lanes ask -> Float, infinite where nothing is met.
 Ends = Callable[[Any, Any, Any], Any]
@@ -96,8 +109,8 @@ def trace_one_sun(
         return np.zeros((n, walks, m_albedos), np.float32)
     if total * m_albedos >= 2**31:
         raise ValueError(f"{total} walks at once need more than 2^31 results: trace fewer points or walks a call")
-    job = _Job(field.types, walks, total, m_albedos, seed, lanes, connect, roulette and bool(np.any(albedos < 1)))
-    _loop(field, _Queries(field.types, points, directions, as_lobes(phase), suns[:, None], albedos), job, _Kind())
+    job = Job(field.types, walks, total, m_albedos, seed, lanes, connect, roulette and bool(np.any(albedos < 1)))
+    _loop(field, Queries(field.types, points, directions, as_lobes(phase), suns[:, None], albedos), job, _Kind())
     return np.array(job.result).reshape(n, walks, m_albedos)
 
 
@@ -149,13 +162,13 @@ def begin_to_escape(
     if n * m_albedos >= 2**31:
         raise ValueError(f"{n} walks at once need more than 2^31 results: trace fewer points a call")
     toward = np.broadcast_to(np.array([0, 0, 1], np.float32), (n, 3)) if suns is None else suns
-    job = _Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
+    job = Job(types, 1, n, m_albedos, seed, lanes, 1.0, bool(varying is not None or np.any(albedos < 1)))
     escapes = Escapes(types, n, m_albedos)
     dr.make_opaque(escapes.position, escapes.direction, escapes.weight, escapes.sunlit, escapes.collided)
     kind = _Kind(
         varying, suns is not None, escapes if watched else None, escapes.sunlit if shaded and suns is not None else None, ends, straight
     )
-    _loop(field, _Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
+    _loop(field, Queries(types, points, directions, as_lobes(phase), toward[:, None], albedos), job, kind)
     dr.eval(job.result, escapes.position, escapes.direction, escapes.weight, escapes.sunlit, escapes.collided)
     return job.result, escapes
 
@@ -192,7 +205,7 @@ class _Kind:
 
 
 @dr.syntax
-def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
+def _loop(field: Field, queries: Queries, job: Job, kind: _Kind) -> None:
     types = field.types
     result, counter, key, lanes = job.result, job.counter, job.key, job.lanes
     varying, escapes, drawn, ends = kind.varying, kind.escapes, kind.drawn, kind.ends
@@ -215,9 +228,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
     rivalry = dr.zeros(Float, lanes)  # 1 over the density with which `direction` was drawn, sr; 0 where no side branch competes
     distance = dr.zeros(Float, lanes)  # along the current segment, world units
     value = dr.zeros(Float, lanes)  # of the connection or branch that is followed up
-    lobes = [_remembered(a, lanes) for a in queries.lobes]
-    sun = Array3f(*(_remembered(a, lanes) for a in queries.suns[0]))
-    albedo = [_remembered(a, lanes) for a in queries.albedos]
+    lobes = [remembered(a, lanes) for a in queries.lobes]
+    sun = Array3f(*(remembered(a, lanes) for a in queries.suns[0]))
+    albedo = [remembered(a, lanes) for a in queries.albedos]
     weight = [dr.zeros(Float, lanes) for _ in range(m_albedos)]
     found = [dr.zeros(Float, lanes) for _ in range(m_albedos)]  # of the walk so far
     # Albedo where a branch has landed, if it varies; else the weight has it already.
@@ -235,7 +248,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
 
     while alive:
         # As in `trace_walks`: lanes that have ended wait for a common turn.
-        if ended & (clock % _TURN == 0):
+        if ended & (clock % TURN == 0):
             if drawn is not None:
                 # Reservoir sampling (Chao 1982): with the probability of its part the vertex stands for all of them.
                 total = sum(found[1:], found[0])
@@ -258,7 +271,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
             number = dr.scatter_inc(counter, UInt32(0), Bool(True))
             alive = number < limit
             point = number // walks_each
-            rng = _stream(types, key, number)
+            rng = stream(types, key, number)
             for i in range(len(lobes)):
                 if dr.width(queries.lobes[i]) > 1:
                     lobes[i] = dr.gather(Float, queries.lobes[i], point, alive)
@@ -273,9 +286,9 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                 weight[m] = Float(1)
             unit = field.to_unit(origin)
             begun = alive & field.holds_unit(unit)
-            rng, u_cosine, u_azimuth = _two_uniform(types, rng)
-            beside, _ = _sample(lobes, u_cosine)
-            ahead = _around(incoming, beside, u_azimuth)
+            rng, u_cosine, u_azimuth = two_uniform(types, rng)
+            beside, _ = sample_phase(lobes, u_cosine)
+            ahead = direction_around(incoming, beside, u_azimuth)
             enter, leave = field.intersect(origin, ahead)
             # From outside the walk begins where it enters; a ray that misses the box starts far beyond it, and so escapes at once.
             position = dr.select(begun, unit, dr.clip(field.to_unit(dr.fma(ahead, enter, origin)), 0, 1))
@@ -291,8 +304,8 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         heading = dr.select(walking, direction, dr.select(task == _BRANCH, side, sun))
         start = dr.select(task == _BRANCH_SHADOW, landing, position)
 
-        rng, u_step = _uniform(types, rng)
-        rng, u_event = _uniform(types, rng)
+        rng, u_step = uniform(types, rng)
+        rng, u_event = uniform(types, rng)
         along = field.direction_to_unit(heading)
         if ends is not None:
             fresh = traced & (distance == 0)
@@ -303,20 +316,20 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         inside = traced & field.holds_unit(unit)
         if ends is not None:
             inside &= distance < reach
-        rng, thirds = _three_uniform(types, rng)
+        rng, thirds = three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
         # Directions are drawn for all while memory is waited for.
-        rng, u_cosine, u_azimuth = _two_uniform(types, rng)
-        beside, of_walk = _sample(lobes, u_cosine)
-        onward = _around(direction, beside, u_azimuth)
+        rng, u_cosine, u_azimuth = two_uniform(types, rng)
+        beside, of_walk = sample_phase(lobes, u_cosine)
+        onward = direction_around(direction, beside, u_azimuth)
         of_vertex, of_branch, u_branch, around = Float(0), Float(0), Float(0), sun
         if kind.sunlit:
-            of_vertex = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, sun)) + rivalry)
-            rng, u_cosine, u_azimuth = _two_uniform(types, rng)
-            rng, u_branch = _uniform(types, rng)
-            beside, of_sun = _sample(lobes, u_cosine)
-            around = _around(sun, beside, u_azimuth)
-            of_branch = 4 * np.pi * dr.rcp(_inverse(lobes, dr.dot(direction, around)) + of_sun)
+            of_vertex = 4 * np.pi * dr.rcp(inverse_phase(lobes, dr.dot(direction, sun)) + rivalry)
+            rng, u_cosine, u_azimuth = two_uniform(types, rng)
+            rng, u_branch = uniform(types, rng)
+            beside, of_sun = sample_phase(lobes, u_cosine)
+            around = direction_around(sun, beside, u_azimuth)
+            of_branch = 4 * np.pi * dr.rcp(inverse_phase(lobes, dr.dot(direction, around)) + of_sun)
         hit = inside & tentative & (u_event < sigma * mean_path)
         gone = traced & ~inside
         over = hit | gone
@@ -344,7 +357,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
                 found[m] += dr.select(lit, arriving[m], 0)
             if drawn is not None:
                 here, all_so_far = sum(arriving[1:], arriving[0]), sum(found[1:], found[0])
-                rng, u_drawn = _uniform(types, rng)
+                rng, u_drawn = uniform(types, rng)
                 chosen = lit & (u_drawn * all_so_far < here)
                 place = dr.select(task == _BRANCH_SHADOW, landing, position)
                 for i in range(3):
@@ -370,7 +383,7 @@ def _loop(field: Field, queries: _Queries, job: _Job, kind: _Kind) -> None:
         left |= gone & walking if kind.straight else gone & walking & scattered
         ended |= gone & walking
         if job.roulette:
-            rng, lost, weight = _thinned(types, rng, weight, turn & ~begun)
+            rng, lost, weight = thinned(types, rng, weight, turn & ~begun)
             ended |= lost
         distance = dr.select(over | begun, 0, distance)
         task = dr.select(shadow, UInt32(_SHADOW), dr.select(branch, UInt32(_BRANCH), dr.select(landed, UInt32(_BRANCH_SHADOW), task)))

@@ -44,8 +44,8 @@ def inverse_hg(cos_theta: Any, g: Any) -> Any:
 def sample_hg(u: Any, g: Any) -> tuple[Any, Any]:
     """One minus the cosine of the scattering angle, by inversion of the cumulative HG density from `u` in [0, 1), and `inverse_hg` there.
 
-    With ``q = 1 - g + 2 g u`` the textbook's cosine ``(1 + g^2 - ((1 - g^2) / q)^2) / (2 g)`` is ``1 - (1 - g)^2 (1 - u) (1 + g + q) / q^2``,
-    which needs no other form near g = 0.
+    With ``q = 1 - g + 2 g u`` the textbook's cosine ``(1 + g^2 - ((1 - g^2) / q)^2) / (2 g)`` is
+    ``1 - (1 - g)^2 (1 - u) (1 + g + q) / q^2``, which needs no other form near g = 0.
     """
     import drjit as dr
 

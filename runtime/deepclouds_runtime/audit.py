@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from deepclouds_runtime.audit_walks import AT_ONCE, Batch, Begun, Rays, Walks
+from deepclouds_runtime.audit_walks import AT_ONCE, Batch, Rays, Walks
 from deepclouds_runtime.camera import Window
 from deepclouds_runtime.correction import FLOOR, Correction, Sums
 from deepclouds_runtime.frame_source import FrameSource
@@ -91,7 +91,7 @@ class Audit:
         self._looked_at: list[tuple[Array, Array, Array, Array]] = []
         self._side = max(1, math.ceil(max(window.width, window.height) / _REGIONS))
         self._area = np.bincount(self._region(window.pixels(np.arange(window.count)))) * (window.share / window.count)
-        self._begun: Begun | None = None
+        self._under_way: Callable[[], Batch] | None = None
         self.count = 0
 
     def _region(self, pixels: Array) -> Array:
@@ -106,17 +106,22 @@ class Audit:
         The last of them are still on their way when it returns: what was found before is added up meanwhile.
         """
         while walks > 0:
-            begun = self._walks.begin(min(walks, AT_ONCE))
+            drawn = self._walks.drawn(min(walks, AT_ONCE))
             walks -= AT_ONCE
-            self._settle()
-            self._begun = begun
-            self.count += begun.count if begun else 0
+            if drawn is None:
+                continue
+            # The device does one thing after the other: results are fetched before it begins the next.
+            done = self._under_way() if self._under_way else None
+            self._under_way = self._walks.begin(drawn)
+            self.count += len(drawn.points)
+            if done is not None:
+                self._add(done)
 
     def _settle(self) -> None:
         """Wait for the walks that are on their way."""
-        if self._begun is not None:
-            self._add(self._begun.finish())
-            self._begun = None
+        if self._under_way is not None:
+            self._add(self._under_way())
+            self._under_way = None
 
     def _add(self, batch: Batch) -> None:
         predicted, walked = batch.predicted, batch.walked

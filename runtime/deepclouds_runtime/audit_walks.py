@@ -56,11 +56,16 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Begun:
-    """Walks on their way: how many, and what waits for them."""
+class Drawn:
+    """Where walks will begin: a `Batch` without what they find, and the directions (n, 3) in which the camera sees their points."""
 
-    count: int
-    finish: Callable[[], Batch]
+    points: Array
+    along: Array
+    pixels: Array
+    groups: Array
+    weights: Array
+    predicted: Array
+    random: np.random.Generator
 
 
 class Walks:
@@ -91,8 +96,8 @@ class Walks:
         #: J (n, channels) of one walk a point, see `LightWalks`.
         self.walked = LightWalks(cloud, lights)
 
-    def begin(self, walks: int) -> Begun | None:
-        """Set off `walks` walks, `AT_ONCE` at most, an even share for each group; no two calls share a random number.
+    def drawn(self, walks: int) -> Drawn | None:
+        """Where `walks` walks, `AT_ONCE` at most, begin, an even share for each group; no two calls share a random number.
 
         None where the camera sees no cloud.
         """
@@ -131,13 +136,14 @@ class Walks:
             weights.append(share[chosen_points] * (total[-1] / wanted[chosen_points]))
             groups.append(np.full(each, group))
         which = np.concatenate(drawn)
-        points, of_ray = seen.points[which], seen.rays[which]
-        walked = self.walked.begin(points, along[of_ray], random)
+        of_ray = seen.rays[which]
+        counted = np.concatenate(weights)
+        return Drawn(seen.points[which], along[of_ray], chosen[of_ray], np.concatenate(groups), counted, predicted[which], random)
 
-        def finish() -> Batch:
-            return Batch(points, chosen[of_ray], np.concatenate(groups), np.concatenate(weights), predicted[which], walked())
-
-        return Begun(len(which), finish)
+    def begin(self, drawn: Drawn) -> Callable[[], Batch]:
+        """Set walks off; what it returns waits for them."""
+        walked = self.walked.begin(drawn.points, drawn.along, drawn.random)
+        return lambda: Batch(drawn.points, drawn.pixels, drawn.groups, drawn.weights, drawn.predicted, walked())
 
 
 def predicted_at(sources: Sequence[FrameSource], points: Array) -> Array:

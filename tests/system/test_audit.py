@@ -7,7 +7,7 @@ correction brings the image nearer to one by walks, images stay positive, and on
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deepclouds_runtime import correction, frame
-from deepclouds_runtime.audit_walks import Batch, Walks
+from deepclouds_runtime.audit_walks import Batch, Drawn, Walks
 from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
@@ -169,14 +169,18 @@ def _from_afar(scene: Path, size: int) -> Path:
 def _watched(monkeypatch: pytest.MonkeyPatch) -> list[Batch]:
     """All batches of walks from now on."""
     seen: list[Batch] = []
-    batches = Walks.batches
+    begin = Walks.begin
 
-    def watched(self: Walks, walks: int) -> Iterator[Batch]:
-        for batch in batches(self, walks):
-            seen.append(batch)
-            yield batch
+    def watched(self: Walks, drawn: Drawn) -> Callable[[], Batch]:
+        finish = begin(self, drawn)
 
-    monkeypatch.setattr(Walks, "batches", watched)
+        def finished() -> Batch:
+            seen.append(finish())
+            return seen[-1]
+
+        return finished
+
+    monkeypatch.setattr(Walks, "begin", watched)
     return seen
 
 

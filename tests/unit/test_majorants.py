@@ -10,7 +10,7 @@ from scipy import ndimage
 from deepclouds.backend import backend
 from deepclouds.medium.field import Field
 from deepclouds.medium.first_collision import first_collisions
-from deepclouds.medium.majorants import Majorants
+from deepclouds.medium.majorants import Majorants, packed
 from deepclouds.volume import Volume
 
 Floats = NDArray[np.float64]
@@ -51,14 +51,15 @@ def test_blocks_bound_the_field_along_every_step(shape: tuple[int, int, int], br
     along[: n // 6] = np.eye(3)[np.arange(n // 6) % 3] * rng.choice([-1.0, 1.0], (n // 6, 1))
     t = field.types
     # u close to 1 makes the step as long as the block allows.
-    distance, _, majorant = field.majorants.step(
+    distance, _, mean_path = field.majorants.step(
         device(field, origin), device(field, along), t.Float(np.zeros(n)), t.Float(1 - 2.0**-24), t.Bool(np.ones(n, bool))
     )
+    majorant = 1 / np.array(mean_path, np.float64)
     assert np.all(np.array(distance) > 0)
     for share in rng.random(24):
         at = origin + share * np.array(distance, np.float64)[:, None] * along
         world = at @ volume.to_world[:3, :3].T + volume.to_world[:3, 3]
-        assert np.all(5.0 * volume.sample(world) <= np.array(majorant) * (1 + 1e-5) + 1e-7)
+        assert np.all(5.0 * volume.sample(world) <= majorant * (1 + 1e-5) + 1e-7)
 
 
 def test_bounds_are_tight_and_blocks_are_what_they_say() -> None:
@@ -109,3 +110,14 @@ def test_first_collisions_do_not_depend_on_the_bricks() -> None:
         difference = other - results[0]
         z = difference.mean(axis=0) / (difference.std(axis=0) / np.sqrt(n))
         assert np.abs(z).max() < 4
+
+
+def test_an_entry_holds_a_bound_from_above_and_a_radius_that_is_not_too_large() -> None:
+    bound, radius = np.geomspace(1e-6, 1e9, 300).astype(np.float32), np.arange(300) * 20
+    entry = packed(bound, radius)
+    mean_path = (entry & np.uint32(0xFFFFF000)).view(np.float32).astype(np.float64)
+    product = mean_path * bound.astype(np.float64)
+    assert product.max() <= 1 + 1e-7
+    assert product.min() > 1 - 1 / 2000
+    np.testing.assert_array_equal(entry & 0xFFF, np.minimum(radius, 4095))
+    assert (packed(np.zeros(1, np.float32), np.ones(1, int)) & np.uint32(0xFFFFF000)).view(np.float32) > 1e29

@@ -13,8 +13,10 @@ from deepclouds.medium.phase import (
     as_lobes,
     hg,
     hg_numpy,
+    inverse_hg,
     ordered_lobes,
     rotate_to,
+    sample_hg,
     sample_hg_cosine,
     sample_two_lobe_cosine,
     two_lobe,
@@ -56,6 +58,20 @@ def test_value_equals_its_twin_and_integrates_to_one(g: float) -> None:
     c = np.concatenate([np.linspace(-1, 1, 2001), 1 - np.geomspace(1e-7, 1, 200), np.geomspace(1e-7, 1, 200) - 1]).astype(np.float32)
     found = np.array(hg(t.Float(c), t.Float(single)), np.float64)
     np.testing.assert_allclose(found, hg_numpy(c, single), rtol=3e-5)
+
+
+@pytest.mark.parametrize("g", ASYMMETRIES)
+def test_a_sampled_cosine_is_that_of_the_textbook_and_comes_with_its_inverse_density(g: float) -> None:
+    t, single = backend(), float(np.float32(g))
+    u = np.concatenate([np.linspace(0, 1, 4096, endpoint=False), np.geomspace(1e-7, 1e-2, 50)]).astype(np.float32)
+    beside, inverse = (np.array(v, np.float64) for v in sample_hg(t.Float(u), t.Float(single)))
+    ratio = (1 - single**2) / (1 - single + 2 * single * u.astype(np.float64))
+    textbook = 2 * u.astype(np.float64) - 1 if g == 0 else (1 + single**2 - ratio**2) / (2 * single)
+    # 1 - g is known to float32's last digit, which counts where a lobe is narrow.
+    np.testing.assert_allclose(1 - beside, textbook, atol=2e-5)
+    np.testing.assert_allclose(inverse * hg_numpy(textbook, single), 1, rtol=1e-4)
+    found = np.array(inverse_hg(t.Float(textbook.astype(np.float32)), t.Float(single)), np.float64)
+    np.testing.assert_allclose(found * hg_numpy(textbook.astype(np.float32), single), 1, rtol=3e-5)
 
 
 def test_positive_g_is_bright_looking_into_the_sun() -> None:

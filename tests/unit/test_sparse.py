@@ -111,8 +111,8 @@ def test_majorants_bound_the_field_and_marches_agree() -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     along = sparse.direction_to_unit(vectors_of(types, directions))
     inside = sparse.holds_unit(unit)
-    _, _, majorant = sparse.majorants.step(unit, along, types.Float(0), types.Float(0.5), inside)
-    assert np.all(np.array(sparse.sigma_t_unit(unit, inside)) <= np.array(majorant) * (1 + 1e-6))
+    _, _, mean_path = sparse.majorants.step(unit, along, types.Float(0), types.Float(0.5), inside)
+    assert np.all(np.array(sparse.sigma_t_unit(unit, inside)) * np.array(mean_path) <= 1 + 1e-6)
     assert sparse.majorants.any_empty
     arguments = (vectors_of(types, points), vectors_of(types, directions), types.Float(0), types.Float(1e4), types.Bool(True))
     a, b = (np.array(optical_depth(f, *arguments)) for f in (dense, sparse))
