@@ -75,15 +75,22 @@ def two_lobe_numpy(cos_theta: ArrayLike, g1: ArrayLike, g2: ArrayLike, weight: A
     return value
 
 
-def sample_two_lobe_cosine(u: Any, g1: Any, g2: Any, weight: Any) -> Any:
-    """Cosine of the scattering angle of `two_lobe`, from `u` in [0, 1): u chooses the lobe and, stretched, the angle in it."""
+def sample_two_lobe(u: Any, g1: Any, g2: Any, weight: Any) -> Any:
+    """One minus the cosine of an angle of `two_lobe`, from `u` in [0, 1): u chooses the lobe and, stretched, the angle in it."""
     import drjit as dr
 
     first = u < weight
     # The guard keeps the lobe that is never chosen from a division by zero.
     share = dr.maximum(dr.select(first, weight, 1 - weight), 1e-12)
     stretched = dr.minimum(dr.select(first, u, u - weight) / share, 1)
-    return sample_hg_cosine(stretched, dr.select(first, g1, g2))
+    return sample_hg(stretched, dr.select(first, g1, g2))[0]
+
+
+def sample_two_lobe_cosine(u: Any, g1: Any, g2: Any, weight: Any) -> Any:
+    """Cosine of the scattering angle of `two_lobe`, from `u` in [0, 1); see `sample_two_lobe`."""
+    import drjit as dr
+
+    return dr.maximum(1 - sample_two_lobe(u, g1, g2, weight), -1)
 
 
 def as_lobes(phase: ArrayLike) -> NDArray[np.float32]:

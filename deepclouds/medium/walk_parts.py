@@ -9,7 +9,7 @@ import numpy as np
 
 from deepclouds.backend import lanes_of
 from deepclouds.medium.elementary import circle
-from deepclouds.medium.phase import hg, inverse_hg, sample_hg, sample_two_lobe_cosine, turned, two_lobe
+from deepclouds.medium.phase import hg, inverse_hg, sample_hg, sample_two_lobe, turned, two_lobe
 
 # Lanes begin walks at every so many steps.
 TURN = 8
@@ -108,8 +108,8 @@ def sample_phase(lobes: list[Any], u: Any) -> tuple[Any, Any]:
     """One minus the cosine of a scattering angle, and one over the phase function there, sr."""
     if len(lobes) == 1:
         return sample_hg(u, *lobes)
-    cosine = sample_two_lobe_cosine(u, *lobes)
-    return 1 - cosine, dr.rcp(two_lobe(cosine, *lobes))
+    beside = sample_two_lobe(u, *lobes)
+    return beside, dr.rcp(two_lobe(1 - beside, *lobes))
 
 
 def direction_around(direction: Any, beside: Any, u_azimuth: Any) -> Any:
