@@ -26,11 +26,12 @@ class Queries:
 
         def upload_or_one(values: Any) -> list[Any]:
             # What is the same for all walks is one number, which no lane has to remember.
-            return [dr.opaque(types.Float, float(v)) for v in values[0]] if np.all(values == values[:1]) else upload(values)
+            same = values.strides[0] == 0 or np.all(values == values[:1])
+            return [dr.opaque(types.Float, float(v)) for v in values[0]] if same else upload(values)
 
         self.points, self.directions = upload(points), upload(directions)
         # A second lobe doubles the cost of a connection: it is left out, with the same result, where no point has one.
-        self.lobes = upload_or_one(lobes[:, :1] if np.all(lobes[:, 2] == 1) else lobes)
+        self.lobes = upload_or_one(lobes[:, :1] if np.all(lobes[: 1 if lobes.strides[0] == 0 else None, 2] == 1) else lobes)
         self.suns = [upload_or_one(suns[:, k]) for k in range(suns.shape[1])]
         self.albedos = upload_or_one(albedos)
         dr.eval(self.points, self.directions, self.lobes, self.suns, self.albedos)

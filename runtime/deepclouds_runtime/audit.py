@@ -117,7 +117,7 @@ class Audit:
             if done is not None:
                 self._add(done)
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
         """Wait for the walks that are on their way."""
         if self._under_way is not None:
             self._add(self._under_way())
@@ -159,18 +159,18 @@ class Audit:
 
     def before(self) -> RegionError:
         """Error of what is audited."""
-        self._settle()
+        self.settle()
         return self._judged(None)
 
     def correction(self) -> Correction:
         """The correction that all walks ask for."""
-        self._settle()
+        self.settle()
         assert self._sums is not None
         return Correction(self._sums)
 
     def remaining(self) -> RegionError:
         """Error that a correction leaves: each half is corrected with what the other half says. That of all walks leaves less."""
-        self._settle()
+        self.settle()
         assert self._sums is not None
         return self._judged([self._step(Correction(self._sums, halves)) for halves in (((2,), (3,)), ((0,), (1,)))])
 
@@ -262,6 +262,8 @@ def audited(
         return Outcome(list(sources), {})
     limit = most
     while True:
+        # What judging takes is to be known without the walks that it would wait for.
+        audit.settle()
         clock = time.perf_counter()
         before = audit.before()
         reached = audit.remaining() if correct else before
