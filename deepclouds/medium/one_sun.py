@@ -318,7 +318,7 @@ def _loop(field: Field, queries: Queries, job: Job, kind: _Kind) -> None:
             inside &= distance < reach
         rng, thirds = three_uniform(types, rng)
         sigma = field.drawn_unit(unit, thirds, inside & tentative)
-        # Directions are drawn for all while memory is waited for.
+        # Where a turn and a side branch would lead, of which a lane takes one at most.
         rng, u_cosine, u_azimuth = two_uniform(types, rng)
         beside, of_walk = sample_phase(lobes, u_cosine)
         onward = direction_around(direction, beside, u_azimuth)
