@@ -137,8 +137,8 @@ class Walks:
             groups.append(np.full(each, group))
         which = np.concatenate(drawn)
         of_ray = seen.rays[which]
-        counted = np.concatenate(weights)
-        return Drawn(seen.points[which], along[of_ray], chosen[of_ray], np.concatenate(groups), counted, predicted[which], random)
+        points, toward, pixels = seen.points.take(which, 0), along.take(of_ray, 0), chosen.take(of_ray)
+        return Drawn(points, toward, pixels, np.concatenate(groups), np.concatenate(weights), predicted.take(which, 0), random)
 
     def begin(self, drawn: Drawn) -> Callable[[], Batch]:
         """Set walks off; what it returns waits for them."""

@@ -116,12 +116,13 @@ class LightWalks:
         """J (n, channels) of walks that are connected to `light`, a `share` of all."""
         cloud, types, n = self._cloud, self._cloud.field.types, len(points)
         shade = self._lights.shade
-        own = on_host(cloud.albedo_at(vectors_of(types, points)), n)
         if cloud.varying is None:
+            own = np.broadcast_to(np.array(cloud.albedo, np.float64), (n, len(cloud.albedo)))
             albedos = tuple(sorted({a for a in cloud.albedo if a > 0}))
             # Which of them each channel has; a black one has any.
             column = [albedos.index(a) if a > 0 else 0 for a in cloud.albedo]
         else:
+            own = on_host(cloud.albedo_at(vectors_of(types, points)), n)
             albedos, column = (), list(range(len(cloud.albedo)))
         toward, arriving = (None, np.zeros((n, len(column)))) if light is None else light.arriving(types, n, random)
         found, escapes = begin_to_escape(
@@ -170,11 +171,13 @@ class LightWalks:
         """Radiance times weight (n, channels) that walks see where they leave the cloud, for each albedo."""
         types, channels = self._cloud.field.types, len(self._cloud.albedo)
         result = [np.zeros((n, channels)) for _ in escapes.weight]
+        if not self._lights.sources:
+            return result
         heaviest = escapes.weight[0]
         for weight in escapes.weight[1:]:
             heaviest = dr.maximum(heaviest, weight)
         lanes: Any = dr.compress(heaviest > 0)
-        if not self._lights.sources or len(lanes) == 0:
+        if len(lanes) == 0:
             return result
         take = taker(types, lanes)
         direction, where = take(escapes.direction), np.array(lanes)
