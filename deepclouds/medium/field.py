@@ -95,7 +95,7 @@ class Field:
     def direction_to_unit(self, d: Any) -> Any:
         """World directions to the unit cube's frame (not normalised)."""
         m = self._to_unit
-        return type(d)(*(dr.fma(d.x, r[0], dr.fma(d.y, r[1], d.z * r[2])) for r in m))
+        return type(d)(*(d.x * r[0] + d.y * r[1] + d.z * r[2] for r in m))
 
     def sigma_t(self, p: Any, active: Any = True) -> Any:
         """Extinction at world points `p`, 1 / world length; zero outside of the box and for inactive lanes."""
