@@ -130,7 +130,7 @@ def test_the_tracker_against_disort(tau: float, g: float) -> None:
 
 @pytest.mark.parametrize("tau", [0.5, 8.0])
 def test_two_lobes_against_disort(tau: float) -> None:
-    check_against_disort(tau, TWO_LOBES, ALBEDOS, rays=300_000, seed=20, precision=0.012)
+    check_against_disort(tau, TWO_LOBES, ALBEDOS, rays=400_000, seed=20, precision=0.012)
 
 
 @pytest.mark.slow

@@ -99,7 +99,7 @@ def relative_error(first: Floats, second: Floats) -> float:
 @pytest.mark.parametrize("phase", [0.6, 0.85, (0.8, -0.4, 0.75)])
 @pytest.mark.parametrize("name", ["cloud", "cube"])
 def test_labels_at_points(name: str, phase: Phase) -> None:
-    first, second = label_maps(name, phase, walks=2048, batches=32)
+    first, second = label_maps(name, phase, walks=2560, batches=32)
     assert relative_error(first, second) < 0.025
     assert first.mean() > 0.1
     report = welch(first, second, tile=4)
