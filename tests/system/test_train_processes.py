@@ -54,7 +54,8 @@ def test_two_processes_give_the_model_of_one(small_dataset: Path, tmp_path: Path
 
     Expected behaviour: after one step Adam's first moments, a tenth of the gradient, are no further apart than 5e-5 of their norm:
     two sums of about eight float32 terms against one of sixteen, which cancel in some of them (2e-5 on one processor).
-    Adam divides a gradient by its own size, so where the terms cancel and nothing but rounding is left the steps that follow differ; after a pool and a half, resumed once, the loss and every validation agree to 0.2 %.
+    Adam divides a gradient by its own size, so where the terms cancel and nothing but rounding is left
+    the steps that follow differ; after a pool and a half, resumed once, the loss and every validation agree to 0.2 %.
     """
     one, two = tmp_path / "one", tmp_path / "two"
     config = config_file(tmp_path, settings(small_dataset, steps=1, companion={"width": 8}, samples={"shards": 4, "queries": 16}))
