@@ -173,18 +173,9 @@ def begin_to_escape(
     return job.result, escapes
 
 
-def trace_to_escape(
-    field: Field,
-    points: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    phase: NDArray[np.float32],
-    suns: NDArray[np.float32] | None,
-    albedos: NDArray[np.float32],
-    seed: int,
-    **how: Any,
-) -> tuple[NDArray[np.float32], Escapes]:
-    """The same, done: float32 array (n, m) and the escapes."""
-    result, escapes = begin_to_escape(field, points, directions, phase, suns, albedos, seed, **how)
+def trace_to_escape(field: Field, points: NDArray[np.float32], *more: Any, **how: Any) -> tuple[NDArray[np.float32], Escapes]:
+    """`begin_to_escape`, done: float32 array (n, m) and the escapes."""
+    result, escapes = begin_to_escape(field, points, *more, **how)
     return np.array(result).reshape(len(points), len(escapes.weight)), escapes
 
 

@@ -93,6 +93,11 @@ def sample_two_lobe_cosine(u: Any, g1: Any, g2: Any, weight: Any) -> Any:
     return dr.maximum(1 - sample_two_lobe(u, g1, g2, weight), -1)
 
 
+def distinct(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The rows; of one row that is seen many times (`np.broadcast_to`) that one, which tells all."""
+    return rows[:1] if len(rows) and rows.strides[0] == 0 else rows
+
+
 def as_lobes(phase: ArrayLike) -> NDArray[np.float32]:
     """Phase functions as rows (g1, g2, weight), float32 (n, 3), from (n, 3) rows or from (n,) single lobes g.
 
@@ -106,8 +111,7 @@ def as_lobes(phase: ArrayLike) -> NDArray[np.float32]:
         rows = np.stack([rows, np.zeros_like(rows), np.ones_like(rows)], axis=1)
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise ValueError(f"a phase function is g or (g1, g2, weight), got an array of shape {np.shape(phase)}")
-    # Of rows that are one row seen many times, one tells all.
-    own = rows[:1] if len(rows) and rows.strides[0] == 0 else rows
+    own = distinct(rows)
     if not (np.all(np.abs(own[:, :2]) < 1) and np.all((own[:, 2] >= 0) & (own[:, 2] <= 1))):
         raise ValueError("a phase function needs -1 < g1, g2 < 1 and a weight from 0 to 1")
     return rows

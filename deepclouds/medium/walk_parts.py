@@ -9,7 +9,7 @@ import numpy as np
 
 from deepclouds.backend import lanes_of
 from deepclouds.medium.elementary import circle
-from deepclouds.medium.phase import hg, inverse_hg, sample_hg, sample_two_lobe, turned, two_lobe
+from deepclouds.medium.phase import distinct, hg, inverse_hg, sample_hg, sample_two_lobe, turned, two_lobe
 
 # Lanes begin walks at every so many steps.
 TURN = 8
@@ -26,12 +26,12 @@ class Queries:
 
         def upload_or_one(values: Any) -> list[Any]:
             # What is the same for all walks is one number, which no lane has to remember.
-            same = values.strides[0] == 0 or np.all(values == values[:1])
+            same = np.all(distinct(values) == values[:1])
             return [dr.opaque(types.Float, float(v)) for v in values[0]] if same else upload(values)
 
         self.points, self.directions = upload(points), upload(directions)
         # A second lobe doubles the cost of a connection: it is left out, with the same result, where no point has one.
-        self.lobes = upload_or_one(lobes[:, :1] if np.all(lobes[: 1 if lobes.strides[0] == 0 else None, 2] == 1) else lobes)
+        self.lobes = upload_or_one(lobes[:, :1] if np.all(distinct(lobes)[:, 2] == 1) else lobes)
         self.suns = [upload_or_one(suns[:, k]) for k in range(suns.shape[1])]
         self.albedos = upload_or_one(albedos)
         dr.eval(self.points, self.directions, self.lobes, self.suns, self.albedos)
