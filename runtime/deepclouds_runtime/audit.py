@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from deepclouds_runtime.audit_walks import AT_ONCE, Batch, Rays, Walks
+from deepclouds_runtime.audit_walks import AT_ONCE, Batch, Looked, Rays, Walks
 from deepclouds_runtime.camera import Window
 from deepclouds_runtime.correction import FLOOR, Correction, Sums
 from deepclouds_runtime.frame_source import FrameSource
@@ -26,7 +26,7 @@ _REGIONS = 20
 # Regions darker than this share of the brightest ones do not count.
 _DARK = 0.02
 # Points at which a correction is looked at to judge it, at least where there are so many walks.
-_LOOKED_AT = 1 << 15
+_LOOKED_AT = 1 << 14
 # Walks of a round, after which somebody is asked whether to go on. The first is judged, which costs as much as tracing some hundred
 # thousand; the next judgement follows when all that may be spent are there.
 ROUND = 1 << 18
@@ -34,6 +34,8 @@ ROUND = 1 << 18
 WALKS_A_PIXEL, WALKS_A_SIGHT, FEWEST, MOST = 4, 32, 1 << 18, 1 << 22
 # Where what is left may still be so many times what was asked for, walks go on to so many times their number.
 _FAR, _FURTHER = 1.25, 3
+# Judging, correcting and applying it take so many times as long as one correction; and how much of the time that is left a round may take.
+_CORRECTIONS, _PART = 10, 0.5
 # Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the
 # root of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
 _SHARE = (0.65, 0.9)
@@ -80,6 +82,11 @@ class Audit:
     ----------
     cloud, lights, sources, rays, window, met, seed
         see `deepclouds_runtime.audit_walks.Walks`; `sources` is what is audited.
+
+    Attributes
+    ----------
+    count, under_way
+        walks so far, and how many of them nobody has waited for.
     """
 
     def __init__(
@@ -91,8 +98,11 @@ class Audit:
         self._looked_at: list[tuple[Array, Array, Array, Array]] = []
         self._side = max(1, math.ceil(max(window.width, window.height) / _REGIONS))
         self._area = np.bincount(self._region(window.pixels(np.arange(window.count)))) * (window.share / window.count)
+        # What was seen for the next walks to begin at, what waits for those on their way, and what these found that is not added up yet.
+        self._ahead: Looked | None = None
         self._under_way: Callable[[], Batch] | None = None
-        self.count = 0
+        self._kept: list[Batch] = []
+        self.count, self.under_way = 0, 0
 
     def _region(self, pixels: Array) -> Array:
         window, width = self._window, self._window.size[0]
@@ -100,28 +110,44 @@ class Audit:
         region: Array = row // self._side * -(-window.width // self._side) + column // self._side
         return region
 
-    def extend(self, walks: int) -> None:
+    def extend(self, walks: int, ahead: bool = True) -> None:
         """Trace `walks` more walks, a fourth of them for each group; the first two groups are one half, the others the other.
 
-        The last of them are still on their way when it returns: what was found before is added up meanwhile.
+        The last of them are still on their way when it returns: what was found before is added up meanwhile. With `ahead` it has looked
+        for where the next ones will begin before these were set off.
         """
         while walks > 0:
-            drawn = self._walks.drawn(min(walks, AT_ONCE))
-            walks -= AT_ONCE
-            if drawn is None:
-                continue
-            # The device does one thing after the other: results are fetched before it begins the next.
+            number = min(walks, AT_ONCE)
+            walks -= number
+            looked, self._ahead = self._ahead or self._walks.look(number), None
+            if looked is None:
+                return
+            drawn = self._walks.drawn(looked, number)
+            # The device does one thing after the other: results are fetched, and the next points looked for, before it begins with these.
             done = self._under_way() if self._under_way else None
+            if ahead or walks > 0:
+                self._ahead = self._walks.look(number)
             self._under_way = self._walks.begin(drawn)
-            self.count += len(drawn.points)
+            self.under_way = len(drawn.points)
+            self.count += self.under_way
             if done is not None:
-                self._add(done)
+                self._keep(done)
 
     def settle(self) -> None:
         """Wait for the walks that are on their way."""
         if self._under_way is not None:
-            self._add(self._under_way())
-            self._under_way = None
+            self._keep(self._under_way())
+            self._under_way, self.under_way = None, 0
+        if self._kept:
+            self._add(Batch.joined(self._kept))
+            self._kept.clear()
+
+    def _keep(self, batch: Batch) -> None:
+        """Put aside what is added up later: each time costs as much as some ten thousand walks."""
+        self._kept.append(batch)
+        if sum(len(kept.points) for kept in self._kept) >= ROUND:
+            self._add(Batch.joined(self._kept))
+            self._kept.clear()
 
     def _add(self, batch: Batch) -> None:
         predicted, walked = batch.predicted, batch.walked
@@ -233,7 +259,7 @@ def audited(
     correct: bool,
     error: float,
     most: int,
-    more: Callable[[float], bool],
+    left: Callable[[], float],
     at_once: int = ROUND,
 ) -> Outcome:
     """Audit sources and, where it helps, correct them.
@@ -245,41 +271,58 @@ def audited(
     correct
         whether to correct.
     error
-        the error to stop at.
+        the error to stop at; 0 goes on until the time is over.
     most
         most walks; in order to correct, three times as many, up to `MOST`, where what is left may then still be above 1.25 times `error`.
-    more
-        is asked between rounds whether to go on; judging and correcting will then take the seconds it is given.
+    left
+        is asked between rounds how many seconds are left for walks, judging and correcting; nothing where somebody interrupts.
     at_once
-        walks of a round.
+        walks of a first round, and of others where there is no time for more.
 
     Returns
     -------
     The sources, and what was found; nothing where the camera sees no cloud.
     """
-    audit.extend(min(at_once, most))
+    clock = time.perf_counter()
+    audit.extend(min(at_once, most), most > at_once)
     if not audit.count:
         return Outcome(list(sources), {})
-    limit = most
-    while True:
-        # What judging takes is to be known without the walks that it would wait for.
-        audit.settle()
-        clock = time.perf_counter()
+
+    def judged() -> tuple[RegionError, RegionError]:
         before = audit.before()
-        reached = audit.remaining() if correct else before
-        if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
-            break
-        # To judge once more and to apply a correction take about three times as long as to judge, and more where more cells are filled.
-        ending = 3 * (time.perf_counter() - clock) / audit.filled
-        if not more(ending * audit.filled):
-            break
-        if correct and 1.1 * audit.count > limit and reached.squared + reached.squared_deviation > (_FAR * error) ** 2:
-            limit = min(_FURTHER * most, max(MOST, most))
-        # A last round that adds little tells nothing new.
-        if 1.1 * audit.count > limit:
-            break
-        while audit.count < limit and more(ending * audit.filled):
-            audit.extend(min(at_once, limit - audit.count))
+        return before, audit.remaining() if correct else before
+
+    audit.settle()
+    pace = (time.perf_counter() - clock) / audit.count
+    if error > 0:
+        limit = most
+        while True:
+            audit.settle()
+            # What judging takes is to be known without the walks that it would wait for.
+            clock = time.perf_counter()
+            before, reached = judged()
+            if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
+                break
+            # To judge once more and to apply a correction take about three times as long as to judge.
+            ending = 3 * (time.perf_counter() - clock)
+            if left() < ending:
+                break
+            if correct and 1.1 * audit.count > limit and reached.squared + reached.squared_deviation > (_FAR * error) ** 2:
+                limit = min(_FURTHER * most, max(MOST, most))
+            # A last round that adds little tells nothing new.
+            if 1.1 * audit.count > limit:
+                break
+            pace = _walk(audit, limit, left, ending / audit.filled, pace, at_once)
+    else:
+        # Nobody asks for the error before the end: a part of the work tells how long the whole will take.
+        clock = time.perf_counter()
+        if correct:
+            audit.correction()
+        else:
+            audit.before()
+        ending = (_CORRECTIONS if correct else 1) * (time.perf_counter() - clock)
+        _walk(audit, most, left, ending / audit.filled, pace, at_once)
+        before, reached = judged()
     found: dict[str, Any] = {"walks": audit.count, "network": before.summary(), "corrected": False}
     if correct:
         correction = audit.correction()
@@ -288,6 +331,28 @@ def audited(
             found |= {"corrected": True, "levels": correction.levels, "remaining": reached.summary()}
             return Outcome(audit.corrected(correction), found)
     return Outcome(list(sources), found)
+
+
+def _walk(audit: Audit, limit: int, left: Callable[[], float], ending: float, pace: float, least: int) -> float:
+    """Trace walks, `limit` in all, in rounds while there is time; returns the seconds that a walk takes.
+
+    What comes after takes `ending` seconds for each cell that is filled. A walk took `pace` seconds; rounds have `least` walks, and where
+    there is time for more, half of those.
+    """
+    clock, before = time.perf_counter(), 0
+    while audit.count < limit:
+        seconds = left() - ending * audit.filled - pace * audit.under_way
+        # The least of rounds takes more than it may, or less than is left: half of that is as near to the end as can be.
+        if not seconds > 0.5 * least * pace:
+            break
+        walks = int(min(max(_PART * seconds / pace, least), ROUND, limit - audit.count))
+        audit.extend(walks, audit.count + walks < limit and pace * walks < seconds)
+        now = time.perf_counter()
+        # Each round waits for the one before.
+        if before:
+            pace = (now - clock) / before
+        clock, before = now, walks
+    return pace
 
 
 def time_for_walks(left: float, one: float, every: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -13,7 +13,7 @@ from deepclouds.backend import lanes_of, rows, vectors_of
 from deepclouds_runtime import stratified
 from deepclouds_runtime.camera import Window
 from deepclouds_runtime.correction import FLOOR, GROUPS
-from deepclouds_runtime.frame_source import FrameSource, seen_by
+from deepclouds_runtime.frame_source import FrameSource, Seen, seen_by
 from deepclouds_runtime.light_walks import LightWalks
 from deepclouds_runtime.lights import on_host
 from deepclouds_runtime.octree import Array
@@ -53,6 +53,34 @@ class Batch:
     weights: Array
     predicted: Array
     walked: Array
+
+    @classmethod
+    def joined(cls, batches: Sequence[Batch]) -> Batch:
+        """Several, one after the other."""
+        return cls(*(np.concatenate([getattr(batch, of.name) for batch in batches]) for of in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What rays saw of the cloud, which walks may begin at.
+
+    Attributes
+    ----------
+    seen
+        collisions of the rays; their weights are shares of what the image shows, in one group.
+    along, pixels
+        directions (r, 3) of the rays, and the numbers (r,) of their pixels.
+    predicted
+        J (n, channels) at the collisions as the image has it.
+    random
+        random numbers that nobody has used.
+    """
+
+    seen: Seen
+    along: Array
+    pixels: Array
+    predicted: Array
+    random: np.random.Generator
 
 
 @dataclass(frozen=True)
@@ -96,8 +124,8 @@ class Walks:
         #: J (n, channels) of one walk a point, see `LightWalks`.
         self.walked = LightWalks(cloud, lights)
 
-    def drawn(self, walks: int) -> Drawn | None:
-        """Where `walks` walks, `AT_ONCE` at most, begin, an even share for each group; no two calls share a random number.
+    def look(self, walks: int) -> Looked | None:
+        """Look for where about `walks` walks, `AT_ONCE` at most, may begin; no two calls share a random number.
 
         None where the camera sees no cloud.
         """
@@ -108,19 +136,23 @@ class Walks:
         count = self._window.count
         rays = max(min(int(walks / _WALKS_A_RAY * self._more), _MOST_RAYS), _LEAST_RAYS) // GROUPS * GROUPS
         index = ((np.arange(rays) + random.random(rays)) * (count / rays)).astype(np.int64)
-        chosen = self._window.pixels(np.minimum(index, count - 1))
-        pixel = lanes_of(types.UInt32, chosen)
+        pixels = self._window.pixels(np.minimum(index, count - 1))
+        pixel = lanes_of(types.UInt32, pixels)
         one = dr.opaque(types.UInt32, 1)
         numbers = Stratified(types, pixel, dr.arange(types.UInt32, rays), one, dr.opaque(types.UInt32, key)).unrelated()
         origin, direction, end = self._rays(pixel, numbers)
         seen = seen_by(self._cloud.field, origin, direction, end, numbers.number(stratified.SHARE), _DEPTHS)
         if not len(seen.points):
             return None
-        along = np.broadcast_to(rows(direction), (rays, 3))
-        predicted = predicted_at(self._sources, seen.points)
-        share = seen.weights * (self._window.share * GROUPS / rays)
+        seen = replace(seen, weights=seen.weights * (self._window.share * GROUPS / rays))
+        return Looked(seen, np.broadcast_to(rows(direction), (rays, 3)), pixels, predicted_at(self._sources, seen.points), random)
+
+    @staticmethod
+    def drawn(looked: Looked, walks: int) -> Drawn:
+        """Where `walks` walks begin, an even share for each group; nothing waits for the device."""
+        seen, share, random = looked.seen, looked.seen.weights, looked.random
         # Walks are noisier where J is larger; some must be left for where the network sees nothing.
-        level = predicted.mean(axis=1)
+        level = looked.predicted.mean(axis=1)
         wanted = share * (level + max(FLOOR * float(np.average(level, weights=share)), 1e-30))
         each = max(walks // GROUPS, 1)
         drawn, weights, groups = [], [], []
@@ -137,8 +169,8 @@ class Walks:
             groups.append(np.full(each, group))
         which = np.concatenate(drawn)
         of_ray = seen.rays[which]
-        points, toward, pixels = seen.points.take(which, 0), along.take(of_ray, 0), chosen.take(of_ray)
-        return Drawn(points, toward, pixels, np.concatenate(groups), np.concatenate(weights), predicted.take(which, 0), random)
+        points, toward, pixels = seen.points.take(which, 0), looked.along.take(of_ray, 0), looked.pixels.take(of_ray)
+        return Drawn(points, toward, pixels, np.concatenate(groups), np.concatenate(weights), looked.predicted.take(which, 0), random)
 
     def begin(self, drawn: Drawn) -> Callable[[], Batch]:
         """Set walks off; what it returns waits for them."""

@@ -35,7 +35,7 @@ CHANCE = 0.5
 # Lattices with fewer walks a node, and all finer ones, are left out: they would cost the most and be believed the least.
 _SPARSE = 32
 # A lattice looks at cells so many times halved from its own, or at the finest.
-_WITHIN = 2
+_WITHIN = 1
 # Independent groups of walks.
 GROUPS = 4
 
@@ -63,6 +63,7 @@ class Sums:
         self.residual = np.zeros((GROUPS, channels, cells))
         self.scale = np.zeros((GROUPS, channels, cells))
         self.square = np.zeros((channels, cells))
+        self._lattices: _Lattices | None = None
 
     def local(self, points: Array) -> Array:
         """World points (n, 3) in longest edges from the box's corner, inside of the box."""
@@ -70,6 +71,7 @@ class Sums:
 
     def add(self, points: Array, weights: Array, predicted: Array, walked: Array, groups: NDArray[np.int64] | int) -> None:
         """Add walks: world points (n, 3), what each counts in the image (n,), J (n, channels) as predicted and as walked, groups (n,)."""
+        self._lattices = None
         local = self.local(points)
         cell = np.ravel_multi_index(tuple(np.minimum((local * _FINE).astype(np.int64), self._size - 1).T), tuple(self._size))
         n = len(self.count)
@@ -83,45 +85,101 @@ class Sums:
             self.scale[:, c] += np.bincount(place, weights * (predicted[:, c] + floor), GROUPS * n).reshape(every)
             self.square[c] += np.bincount(cell, np.square(residual), n)
 
-    def cells(self, halves: tuple[tuple[int, ...], tuple[int, ...]]) -> _Cells:
-        """The finest cells that hold walks, and what two halves of the groups have in them."""
-        filled = np.flatnonzero(self.count)
-        residual, scale = (
-            np.stack([values[list(half)][:, :, filled].sum(axis=0) for half in halves]) for values in (self.residual, self.scale)
-        )
-        cells = np.stack(np.unravel_index(filled, tuple(self._size)), axis=1)
+    def lattices(self) -> _Lattices:
+        """Where walks began, as lattices look at it; the same for all corrections until walks are added."""
+        if self._lattices is None:
+            self._lattices = _Lattices(self.count, self._place, self._size, self.edges)
+        return self._lattices
+
+    def of_halves(self, halves: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[Array, Array, Array]:
+        """What two halves of the groups have in the finest cells that hold walks.
+
+        Residuals and scales (2, channels, m), and the variance (channels, m) of a cell's residual, which is that of as many walks of a
+        wide neighbourhood.
+        """
+        lattices = self.lattices()
+        filled = lattices.filled
+
+        def of_each(values: Array) -> Array:
+            return np.stack([np.sum([values[group][:, filled] for group in half], axis=0) for half in halves])
+
         share = sum(map(len, halves)) / GROUPS
-        return _Cells(cells, self.count[filled], self._place[:, filled], residual, scale, self.square[:, filled] * share)
+        return of_each(self.residual), of_each(self.scale), lattices.pooled(self.square[:, filled] * share)
 
 
-class _Cells:
-    """What cells of one size hold: numbers (m, 3) of the cells, walks (m,), and sums of their places, residuals and scales."""
+class _Lattice:
+    """The nodes of one lattice around the cells that it looks at.
 
-    def __init__(self, cells: NDArray[np.int64], count: Array, places: Array, residual: Array, scale: Array, variance: Array) -> None:
-        self._cells, self.count, self._places, self.residual, self.scale = cells, count, places, residual, scale
-        self.variance = variance
-        self.place = (places / count).T
+    Attributes
+    ----------
+    level, size, count
+        of the lattice: its number, its cells along each axis, how many nodes it has.
+    coarser
+        how often these cells were halved.
+    index, tent
+        nodes (m, 8) around each of them, and their weights.
+    """
 
-    def pooled(self, edges: Array) -> _Cells:
-        """The same where the variance (channels, m) of each cell's sum is that of as many walks of a wide neighbourhood."""
-        index, tent, count = _tents(self.place, cells_along(edges, _POOLED), _POOLED)
-        below = np.maximum(_at_nodes(self.count, index, tent, count), 1e-300)
-        around = [_at_nodes(of_channel, index, tent, count) / below for of_channel in self.variance]
-        variance = np.stack([self.count * (tent * of_node[index]).sum(axis=1) for of_node in around])
-        return _Cells(self._cells, self.count, self._places, self.residual, self.scale, variance)
+    def __init__(self, level: int, size: NDArray[np.int64], coarser: int, places: Array) -> None:
+        self.level, self.size, self.coarser = level, size, coarser
+        self.index, self.tent, self.count = _tents(places, size, level)
+        self._squared = np.square(self.tent)
 
-    def halved(self) -> _Cells:
-        """Cells of twice the edge."""
-        cells = self._cells // 2
-        size = cells.max(axis=0) + 1
-        filled, into = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)), return_inverse=True)
+    def gathered(self, values: Array) -> Array:
+        """Sums (nodes,) of what cells hold (m,)."""
+        return _at_nodes(values, self.index, self.tent, self.count)
 
-        def together(values: Array) -> Array:
-            flat = values.reshape(-1, values.shape[-1])
-            return np.stack([np.bincount(into, row, len(filled)) for row in flat]).reshape(*values.shape[:-1], len(filled))
+    def variance(self, values: Array) -> Array:
+        """Variances (nodes,) of these sums, of the cells' variances (m,)."""
+        return _at_nodes(values, self.index, self._squared, self.count)
 
-        numbers = np.stack(np.unravel_index(filled, tuple(size)), axis=1)
-        return _Cells(numbers, *(together(v) for v in (self.count, self._places, self.residual, self.scale, self.variance)))
+    def between(self, values: Array) -> Array:
+        """Values (nodes, channels) interpolated at the cells' places, (m, channels)."""
+        result: Array = np.einsum("mk,mkc->mc", self.tent, values[self.index])
+        return result
+
+
+class _Lattices:
+    """The cells that hold walks, fine to coarse, and the lattices that they are enough for, coarse to fine."""
+
+    def __init__(self, count: Array, place: Array, size: NDArray[np.int64], edges: Array) -> None:
+        self.filled = np.flatnonzero(count)
+        self._count, places = count[self.filled], place[:, self.filled]
+        numbers = np.stack(np.unravel_index(self.filled, tuple(size)), axis=1)
+        counts, total = [self._count], float(self._count.sum())
+        centres = [(places / self._count).T]
+        # How to add up cells to those of twice the edge: an order of theirs, and where each of the larger ones begins in it.
+        self._steps: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+        while len(counts) < _LEVELS:
+            numbers = numbers // 2
+            key = np.ravel_multi_index(tuple(numbers.T), tuple(numbers.max(axis=0) + 1))
+            order = np.argsort(key, kind="stable")
+            first = np.flatnonzero(np.diff(key[order], prepend=-1))
+            self._steps.append((order, first))
+            counts.append(np.add.reduceat(counts[-1][order], first))
+            places = np.add.reduceat(places[:, order], first, axis=1)
+            centres.append((places / counts[-1]).T)
+            numbers = numbers[order[first]]
+        self._pooling = _Lattice(_POOLED, cells_along(edges, _POOLED), 0, centres[0])
+        self.levels: list[_Lattice] = []
+        for level in range(-1, _LEVELS):
+            coarser = max(_LEVELS - 1 - _WITHIN - level, 0)
+            lattice = _Lattice(level, cells_along(edges, level), coarser, centres[coarser])
+            if total < _SPARSE * np.count_nonzero(lattice.gathered(np.ones(len(counts[coarser])))):
+                break
+            self.levels.append(lattice)
+
+    def pooled(self, square: Array) -> Array:
+        """Variances (channels, m) of the finest cells' sums: of as many walks of a wide neighbourhood, by the squares of their own."""
+        below = np.maximum(self._pooling.gathered(self._count), 1e-300)
+        around = np.stack([self._pooling.gathered(of_channel) / below for of_channel in square], axis=1)
+        return self._count * self._pooling.between(around).T
+
+    def halved(self, values: Array, times: int) -> Array:
+        """What cells (..., m) hold that were halved so often, of twice the edge."""
+        order, first = self._steps[times]
+        result: Array = np.add.reduceat(values[..., order], first, axis=-1)
+        return result
 
 
 class Correction:
@@ -146,31 +204,28 @@ class Correction:
         self._field, self._level, self.levels = np.zeros((1, 1, 1, channels)), -1, 0
         if not sums.count.any():
             return
-        sizes = [sums.cells(halves).pooled(sums.edges)]
-        while len(sizes) < _LEVELS:
-            sizes.append(sizes[-1].halved())
+        lattices = sums.lattices()
+        sizes: list[tuple[Array, ...]] = [sums.of_halves(halves)]
+        for times in range(lattices.levels[0].coarser if lattices.levels else 0):
+            sizes.append(tuple(lattices.halved(values, times) for values in sizes[-1]))
         field = self._field
-        for level in range(-1, _LEVELS):
-            cells = sizes[max(_LEVELS - 1 - _WITHIN - level, 0)]
-            size = cells_along(sums.edges, level)
-            field = _refined(field, size, level)
-            index, tent, count = _tents(cells.place, size, level)
-            if cells.count.sum() < _SPARSE * np.count_nonzero(_at_nodes(np.ones(len(cells.count)), index, tent, count)):
-                break
-            known = np.einsum("mk,mkc->cm", tent, field.reshape(count, channels)[index])
-            values = np.zeros((count, channels))
+        for lattice in lattices.levels:
+            residual, scale, variance = sizes[lattice.coarser]
+            field = _refined(field, lattice.size, lattice.level)
+            known = lattice.between(field.reshape(lattice.count, channels)).T
+            values = np.zeros((lattice.count, channels))
             for c in range(channels):
-                left = [_at_nodes(r[c] - s[c] * known[c], index, tent, count) for r, s in zip(cells.residual, cells.scale, strict=True)]
-                below = [_at_nodes(s[c], index, tent, count) for s in cells.scale]
-                values[:, c] = _shrunken(left, below, _at_nodes(cells.variance[c], index, np.square(tent), count), size)
+                left = [lattice.gathered(r[c] - s[c] * known[c]) for r, s in zip(residual, scale, strict=True)]
+                below = [lattice.gathered(s[c]) for s in scale]
+                values[:, c] = _shrunken(left, below, lattice.variance(variance[c]), lattice.size)
             if not values.any():
                 continue
-            if level >= 0:
+            if lattice.level >= 0:
                 # What the image is brighter or darker as a whole, the single number knows best: a finer level only moves light about.
-                moved, total = np.einsum("mk,mkc->cm", tent, values[index]), cells.scale.sum(axis=0)
+                moved, total = lattice.between(values).T, scale.sum(axis=0)
                 values -= (moved * total).sum(axis=1) / np.maximum(total.sum(axis=1), 1e-300)
             field = field + values.reshape(field.shape)
-            self._field, self._level = field, level
+            self._field, self._level = field, lattice.level
             self.levels += 1
 
     def __call__(self, points: Array) -> Array:
@@ -209,17 +264,14 @@ def _around(nodes: Array, size: Array, values: Sequence[Array]) -> list[Array]:
     block = tuple(place // _BLOCK for place in np.unravel_index(nodes, tuple(size + 1)))
     blocks = tuple(size // _BLOCK + 1)
     index = np.ravel_multi_index(block, blocks)
-    found = []
-    for value in values:
-        grid = np.bincount(index, value, int(np.prod(blocks))).reshape(blocks)
-        for axis in range(3):
-            along, total = np.moveaxis(grid, axis, 0), grid.copy()
-            sums = np.moveaxis(total, axis, 0)
-            sums[1:] += along[:-1]
-            sums[:-1] += along[1:]
-            grid = total
-        found.append(grid.ravel()[index])
-    return found
+    grid = np.stack([np.bincount(index, value, int(np.prod(blocks))) for value in values]).reshape(len(values), *blocks)
+    for axis in range(1, 4):
+        after, before = ((slice(None),) * axis + (part,) for part in (slice(1, None), slice(None, -1)))
+        total = grid.copy()
+        total[after] += grid[before]
+        total[before] += grid[after]
+        grid = total
+    return list(grid.reshape(len(values), -1)[:, index])
 
 
 def cells_along(edges: Array, level: int) -> NDArray[np.int64]:

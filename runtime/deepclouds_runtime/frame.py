@@ -462,10 +462,10 @@ class Frame:
             most = int(np.clip(usual * (ERROR / error) ** 2, FEWEST, MOST))
             at_once = ROUND
 
-        def more(seconds: float) -> bool:
-            return time.perf_counter() + seconds < until and not (interrupted is not None and interrupted())
+        def left() -> float:
+            return 0.0 if interrupted is not None and interrupted() else until - time.perf_counter()
 
-        outcome = audited(found, self.sources, correct, error, most, more, at_once)
+        outcome = audited(found, self.sources, correct, error, most, left, at_once)
         self.sources, self.found = outcome.sources, outcome.found
         self.spent("audit", clock)
 
