@@ -273,7 +273,7 @@ def audited(
     error
         the error to stop at; 0 goes on until the time is over.
     most
-        most walks; in order to correct, three times as many, up to `MOST`, where what is left may then still be above 1.25 times `error`.
+        most walks; in order to correct, up to three times as many, and `MOST`, as bring what may then still be left to 1.25 times `error`.
     left
         is asked between rounds how many seconds are left for walks, judging and correcting; nothing where somebody interrupts.
     at_once
@@ -307,8 +307,9 @@ def audited(
             ending = 3 * (time.perf_counter() - clock)
             if left() < ending:
                 break
-            if correct and 1.1 * audit.count > limit and reached.squared + reached.squared_deviation > (_FAR * error) ** 2:
-                limit = min(_FURTHER * most, max(MOST, most))
+            if correct and 1.1 * audit.count > limit and (far := (reached.squared + reached.squared_deviation) / (_FAR * error) ** 2) > 1:
+                # What is left falls with about the fourth root of the number of walks.
+                limit = min(int(audit.count * far**2), _FURTHER * most, max(MOST, most))
             # A last round that adds little tells nothing new.
             if 1.1 * audit.count > limit:
                 break

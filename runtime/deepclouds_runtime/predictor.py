@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -99,13 +100,16 @@ class Predictor:
     def _run(self, session: Any, inputs: dict[str, NDArray[np.float32]], outputs: int) -> list[NDArray[np.float32]]:
         """All outputs of a graph, in batches, one a thread."""
         n = len(inputs[INPUT_AUX])
+        # Equal ones, and an even number of them: of two threads neither waits for the other. The same for any number of threads, since how
+        # a product is rounded may depend on its size.
+        size = max(math.ceil(n / (2 * max(math.ceil(n / (2 * BATCH)), 1))), 1)
         found: list[list[NDArray[np.float32]]] = [[] for _ in range(outputs)]
 
         def run(start: int) -> list[NDArray[np.float32]]:
-            result: list[NDArray[np.float32]] = session.run(None, {k: v[start : start + BATCH] for k, v in inputs.items()})
+            result: list[NDArray[np.float32]] = session.run(None, {k: v[start : start + size] for k, v in inputs.items()})
             return result
 
-        for part in self._threads.map(run, range(0, n, BATCH)):
+        for part in self._threads.map(run, range(0, n, size)):
             for values, value in zip(found, part, strict=True):
                 values.append(value)
         return [np.concatenate(values) if values else np.empty(0, np.float32) for values in found]
@@ -133,11 +137,14 @@ class Predictor:
         if trust is None:
             return None
         result = np.empty(len(j), np.float32)
-        # What one batch reads again is still in the cache.
-        for start in range(0, len(j), BATCH):
+
+        def fill(start: int) -> None:
             rows = slice(start, start + BATCH)
             distance = trust.distance(stencil[rows], aux[rows], None if coarse is None else coarse[rows])
             result[rows] = trust.expected_error(distance, j[rows]) * (j[rows] + FLOOR)
+
+        # What one batch reads again is still in the cache.
+        list(self._threads.map(fill, range(0, len(j), BATCH)))
         return result
 
     def out_of_range(self, aux: NDArray[np.float32]) -> dict[str, int]:
