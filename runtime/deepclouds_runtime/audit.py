@@ -32,8 +32,8 @@ _LOOKED_AT = 1 << 14
 ROUND = 1 << 18
 # Walks by default: so many a pixel of the image, or of what shows the cloud if these are fewer, within these limits.
 WALKS_A_PIXEL, WALKS_A_SIGHT, FEWEST, MOST = 4, 32, 1 << 18, 1 << 22
-# Where what is left may still be so many times what was asked for, walks go on to so many times their number.
-_FAR, _FURTHER = 1.25, 3
+# Where a correction leaves more than was asked for, walks go on to so many times their number at most.
+_FURTHER = 3
 # Judging, correcting and applying it take so many times as long as one correction; and how much of the time that is left a round may take.
 _CORRECTIONS, _PART = 10, 0.5
 # Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the
@@ -273,7 +273,7 @@ def audited(
     error
         the error to stop at; 0 goes on until the time is over.
     most
-        most walks; in order to correct, up to three times as many, and `MOST`, as bring what may then still be left to 1.25 times `error`.
+        most walks; in order to correct as many more as bring what is left to `error`, up to three times their number, and `MOST`.
     left
         is asked between rounds how many seconds are left for walks, judging and correcting; nothing where somebody interrupts.
     at_once
@@ -307,9 +307,10 @@ def audited(
             ending = 3 * (time.perf_counter() - clock)
             if left() < ending:
                 break
-            if correct and 1.1 * audit.count > limit and (far := (reached.squared + reached.squared_deviation) / (_FAR * error) ** 2) > 1:
-                # What is left falls with about the fourth root of the number of walks.
-                limit = min(int(audit.count * far**2), _FURTHER * most, max(MOST, most))
+            if correct and 1.1 * audit.count > limit:
+                # What is left, squared, falls with about the root of the number of walks.
+                enough = audit.count * (max(reached.squared, 0.0) / error**2) ** 2
+                limit = int(min(enough, _FURTHER * most, max(MOST, most)))
             # A last round that adds little tells nothing new.
             if 1.1 * audit.count > limit:
                 break
