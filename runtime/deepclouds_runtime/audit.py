@@ -273,7 +273,7 @@ def audited(
     error
         the error to stop at; 0 goes on until the time is over.
     most
-        most walks; in order to correct as many more as bring what is left to `error`, up to three times their number, and `MOST`.
+        most walks; in order to correct as many more as bring what is left to `error`, up to three times their number and `MOST`.
     left
         is asked between rounds how many seconds are left for walks, judging and correcting; nothing where somebody interrupts.
     at_once
@@ -344,7 +344,7 @@ def _walk(audit: Audit, limit: int, left: Callable[[], float], ending: float, pa
     clock, before = time.perf_counter(), 0
     while audit.count < limit:
         seconds = left() - ending * audit.filled - pace * audit.under_way
-        # The least of rounds takes more than it may, or less than is left: half of that is as near to the end as can be.
+        # Of rounds that cannot be smaller the last one ends no further beyond the time than it would have ended before it.
         if not seconds > 0.5 * least * pace:
             break
         walks = int(min(max(_PART * seconds / pace, least), ROUND, limit - audit.count))

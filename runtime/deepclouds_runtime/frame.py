@@ -455,12 +455,11 @@ class Frame:
         width, height = self.scene.size
         error /= self._weight
         found = Audit(self.cloud, self._of_image, self.sources, self._camera_rays, self._window, self._looked().met, self.seed)
-        most, at_once = _MOST_TIMED, _TIMED_ROUND
-        if math.isinf(until):
+        most, at_once = _MOST_TIMED, ROUND if math.isinf(until) else _TIMED_ROUND
+        if error > 0:
             # Walks are as noisy as any path: half of the error takes four times as many.
             usual = min(WALKS_A_PIXEL * width * height, WALKS_A_SIGHT * self._looked().met * self._window.count)
             most = int(np.clip(usual * (ERROR / error) ** 2, FEWEST, MOST))
-            at_once = ROUND
 
         def left() -> float:
             return 0.0 if interrupted is not None and interrupted() else until - time.perf_counter()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deepclouds_runtime import correction, frame
+from deepclouds_runtime.audit import FEWEST
 from deepclouds_runtime.audit_walks import Batch, Drawn, Walks
 from deepclouds_runtime.correction import GROUPS, Correction, Sums
 from deepclouds_runtime.loading import load
@@ -221,6 +222,12 @@ def test_a_cloud_far_away_is_corrected_as_well(scene: Path, monkeypatch: pytest.
     low, high = found["remaining"]["energy_interval"]
     assert low < 0 < high
     assert high - low < 0.03
+
+
+def test_an_error_that_is_reached_ends_the_walks_before_the_time(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = rendered(scene, monkeypatch, "smooth", spp=None, correct=True, error=0.05, time_limit=60)
+    assert found.statistics.audit["corrected"]
+    assert found.statistics.audit["walks"] <= 3 * FEWEST
 
 
 def test_nodes_are_no_finer_than_pixels(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
