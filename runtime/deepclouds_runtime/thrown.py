@@ -44,6 +44,8 @@ class ThrownLight:
         pixels = size[0] * size[1]
         self._light, self._share = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
         self._place, self._normal, self._count = np.zeros((pixels, 3)), np.zeros((pixels, 3)), np.zeros(pixels)
+        # What is asked for again and again, between two rounds of samples.
+        self._smoothed: Image | None = None
 
     def add(
         self, pixels: NDArray[np.uint32], samples: int, light: list[Any], share: list[Any], place: Any, normal: Any, counted: Any
@@ -60,6 +62,7 @@ class ThrownLight:
             Bool: which samples are on a matt surface; the others add nothing.
         """
         dr.eval(light, share, place, normal, counted)
+        self._smoothed = None
 
         def total(value: Any) -> NDArray[np.float32]:
             return np.array(dr.block_sum(dr.select(counted, value, 0), samples))
@@ -73,7 +76,12 @@ class ThrownLight:
         self._count[pixels] += total(self._types.Float(1))
 
     def smoothed(self) -> Image:
-        """Sum of the samples of each pixel (pixels, 3), smoothed."""
+        """Sum of the samples of each pixel (pixels, 3), smoothed: not to be written to."""
+        if self._smoothed is None:
+            self._smoothed = self._averages()
+        return self._smoothed
+
+    def _averages(self) -> Image:
         types, (width, height) = self._types, self._size
         if not self._count.any():
             return self._light

@@ -27,8 +27,21 @@ def _smoothed(
     matt: NDArray[np.bool_] | None = None,
     samples: int = 1,
 ) -> Floats:
+    film = ThrownLight(backend(), SIZE, box)
+    _add(film, light, share, place, normal, matt, samples)
+    return film.smoothed().astype(np.float64)
+
+
+def _add(
+    film: ThrownLight,
+    light: Floats,
+    share: Floats,
+    place: Floats,
+    normal: Floats,
+    matt: NDArray[np.bool_] | None = None,
+    samples: int = 1,
+) -> None:
     types = backend()
-    film = ThrownLight(types, SIZE, box)
 
     def floats(values: Floats) -> list[object]:
         return [types.Float(np.repeat(values[:, c], samples).astype(np.float32)) for c in range(values.shape[1])]
@@ -36,7 +49,6 @@ def _smoothed(
     counted = types.Bool(np.ones(PIXELS * samples, bool) if matt is None else np.repeat(matt, samples))
     pixels = np.arange(PIXELS, dtype=np.uint32)
     film.add(pixels, samples, floats(light), floats(share), types.Array3f(*floats(place)), types.Array3f(*floats(normal)), counted)
-    return film.smoothed().astype(np.float64)
 
 
 @pytest.fixture
@@ -90,3 +102,15 @@ def test_what_is_not_matt_adds_nothing(plane: tuple[Floats, Floats]) -> None:
     np.testing.assert_allclose(out[matt], 1, rtol=1e-5)
     assert not out[~matt].any()
     assert not _smoothed(light, np.ones((PIXELS, 3)), *plane, matt=np.zeros(PIXELS, bool)).any()
+
+
+def test_more_samples_are_smoothed_too(plane: tuple[Floats, Floats]) -> None:
+    """What was asked for before they came is what there was."""
+    film, share = ThrownLight(backend(), SIZE, (np.array([0.0, 50, 0]), np.array([1.0, 51, 1]))), np.ones((PIXELS, 3))
+    _add(film, share, share, *plane)
+    first = film.smoothed()
+    assert film.smoothed() is first
+    kept = first.copy()
+    _add(film, 2 * share, share, *plane)
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_allclose(film.smoothed(), 3, rtol=1e-5)
