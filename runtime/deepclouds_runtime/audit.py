@@ -138,14 +138,16 @@ class Audit:
         if self._under_way is not None:
             self._keep(self._under_way())
             self._under_way, self.under_way = None, 0
-        if self._kept:
-            self._add(Batch.joined(self._kept))
-            self._kept.clear()
+        self._add_kept()
 
     def _keep(self, batch: Batch) -> None:
         """Put aside what is added up later: each time costs as much as some ten thousand walks."""
         self._kept.append(batch)
         if sum(len(kept.points) for kept in self._kept) >= ROUND:
+            self._add_kept()
+
+    def _add_kept(self) -> None:
+        if self._kept:
             self._add(Batch.joined(self._kept))
             self._kept.clear()
 
@@ -297,8 +299,6 @@ def audited(
     if error > 0:
         limit = most
         while True:
-            audit.settle()
-            # What judging takes is to be known without the walks that it would wait for.
             clock = time.perf_counter()
             before, reached = judged()
             if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
@@ -315,6 +315,8 @@ def audited(
             if 1.1 * audit.count > limit:
                 break
             pace = _walk(audit, limit, left, ending / audit.filled, pace, at_once)
+            # What judging takes is to be known without the walks that it would wait for.
+            audit.settle()
     else:
         # Nobody asks for the error before the end: a part of the work tells how long the whole will take.
         clock = time.perf_counter()

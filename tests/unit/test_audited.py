@@ -61,7 +61,8 @@ def ran(
 ) -> Any:
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: audit.now))
     every: Any = audit
-    return audited(every, ["predicted"], True, error, most, lambda: until - audit.now, first)  # type: ignore[list-item]
+    sources: Any = ["predicted"]
+    return audited(every, sources, True, error, most, lambda: until - audit.now, first)
 
 
 @pytest.mark.parametrize(("left", "times"), [(0.3, 0.25), (0.7, 0.25), (0.99, 1), (1.0, 1), (1.2, 1.2**4), (1.3, 1.3**4), (1.4, 3), (5, 3)])
