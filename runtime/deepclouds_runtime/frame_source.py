@@ -291,7 +291,7 @@ def frame_source(
     nodes = max(1, budget // (len(lights) * len(albedos) * len(eyes)))
     checks = max(_LEAST_CHECKS, _CHECKS // (len(lights) * len(eyes)))
     how = cloud.field, network, predicted, seen, root, tolerance, nodes, checks, len(lights), every, until
-    return interpolated(*how, finest=finest, shade=shade)
+    return interpolated(*how, finest=finest, shade=shade, trials=checks)
 
 
 class Evaluates(Protocol):
@@ -336,6 +336,7 @@ def interpolated(
     overdrawn: int = _OVERDRAWN,
     finest: float = 0.0,
     shade: Shade | None = None,
+    trials: int = 0,
 ) -> FrameSource:
     """What `evaluate` says at the nodes of an octree, interpolated.
 
@@ -351,15 +352,19 @@ def interpolated(
         points at which the interpolation is measured.
     lights
         how many there are, for a report.
+    trials
+        points at which the octree sees what it errs while it is built, see `Octree`; for what has no noise.
     """
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
     held_out, built_for = _split(seen, min(checks, len(seen.points) // 2))
+    tried, built_for = _split(built_for, min(trials, len(built_for.points) // 2))
+    asked = np.concatenate([held_out.points, tried.points])
     paced = _Paced(evaluate, until)
     # The pace is that of the last call: the first one may have kernels to compile.
-    parts = [paced(part) for part in np.array_split(held_out.points, 1 if math.isinf(until) else 2) if len(part)]
+    parts = [paced(part) for part in np.array_split(asked, 1 if math.isinf(until) else 2) if len(part)]
     true = np.concatenate(parts) if parts else np.empty((0, 0))
     spacing, most = root * network.descriptor.unit, min(overdrawn * nodes, max(paced.affordable(), _LEAST_CORNERS))
     # Splits between the coarsest cells and the finest that anybody can tell apart; where these are the larger ones, all are as large.
@@ -374,14 +379,15 @@ def interpolated(
     # Nothing is split where the corners take all there is.
     evaluate.on_lattice(lattice, levels if root_nodes(lattice, seen.points, 0) < nodes else 0)
     place = _BeforeSurfaces(field.types, shade) if shade is not None and shade.surfaces is not None else None
-    how = tolerance, nodes, levels, evaluate.carried, paced.affordable, place
+    known = len(held_out.points)
+    how = tolerance, nodes, levels, evaluate.carried, paced.affordable, place, (tried.points, true[known:]) if len(tried.points) else None
     octree = Octree(lattice, paced, built_for.points, built_for.weights, *how)
     device = octree.upload(field.types)
-    factor, error, means = _audit(device, true, held_out, every)
+    factor, error, means = _audit(device, true[:known], held_out, every)
     level = float(means @ evaluate.mix.mean(axis=0)) if len(means) == evaluate.mix.shape[1] else 1.0
     doubt = octree.upload(field.types, carried=True) if evaluate.carried else None
-    asked = evaluate.queries, evaluate.shared, lights, evaluate.model
-    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, *asked, doubt, octree, level, evaluate.spared)
+    counts = evaluate.queries, evaluate.shared, lights, evaluate.model
+    return FrameSource(device, evaluate.mix * factor, octree.statistics, error, *counts, doubt, octree, level, evaluate.spared)
 
 
 def part_of_time(until: float, share: float) -> float:

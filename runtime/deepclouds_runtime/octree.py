@@ -29,6 +29,8 @@ _MOST_CELLS_A_SIDE = 64
 _GAIN = 3.0
 # Error that is taken for that of root cells, of which nothing is known, over the mean value.
 _UNMEASURED = 0.15
+# Trials by which the errors of cells that count about as much are judged together.
+_TRIALS_A_GROUP = 32
 # Times that values at the nodes are drawn to what is wanted between them.
 _SWEEPS = 4
 # New corners of a cell that is split: neighbours share most of the 19 that all of its children have.
@@ -141,6 +143,9 @@ class Octree:
         is asked before each level how many more points may be asked for, for another reason than the budget.
     place
         corners of cells, world points (n, 3), and for each one of `points` (n, 3) that lies near -> where the corner's value is asked for.
+    tried
+        world points (n, 3), drawn from `points` by weight, and the true values there (n, k): what a cell errs at those that it holds
+        counts for its error. Corners alone tell nothing where all of a cell's lie outside of the cloud.
 
     Attributes
     ----------
@@ -160,6 +165,7 @@ class Octree:
         carried: int = 0,
         affordable: Callable[[], int] | None = None,
         place: Callable[[Array, Array], Array] | None = None,
+        tried: tuple[Array, Array] | None = None,
     ) -> None:
         self.lattice = lattice
         self._place = place
@@ -187,11 +193,14 @@ class Octree:
         # An entry of the table is the number of a leaf, or less than 0: where the eight entries of the children begin.
         table, slots, count = np.arange(nx * ny * nz), cells, nx * ny * nz
         scale = self._scale(local, member, weights, values, coordinates, 0)
+        trials = None if tried is None else _Trials(lattice, *tried, self.fields, cells)
         known_error = np.full(len(cells), _UNMEASURED * scale)
         settled = 0.0
         total = float(weights.sum())
         for level in range(self._levels + 1):
             share = np.bincount(member, weights, minlength=len(coordinates))
+            if trials is not None:
+                known_error = trials.error(known_error, share, values, coordinates, level)
             squared = share * known_error**2
             allowed = (tolerance * scale) ** 2 * total
             # Half of what is left of the error for this level, the rest for the finer ones.
@@ -212,6 +221,8 @@ class Octree:
             parents, before, blocks = coordinates[split], values[split], int(split.sum())
             child = (local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[member]
             member = 8 * member + child @ (1, 2, 4)
+            if trials is not None:
+                trials.descend(split, parents, level)
             coordinates = (2 * parents[:, None] + CORNERS).reshape(-1, 3)
             near = np.repeat(near[split], 8, axis=0)
             near[member] = points
@@ -339,6 +350,65 @@ class Octree:
             place[inner] = 2 * place[inner] - octant
             leaf[inner] = self._table[octant @ (1, 2, 4) - leaf[inner]]
         return leaf, trilinear(place)
+
+
+class _Trials:
+    """Points at which the true values are known, on their way down an octree that is being built.
+
+    Parameters
+    ----------
+    lattice
+        the root cells.
+    points, values
+        world points (n, 3), and the true values there (n, k).
+    fields
+        how many of the values, the first ones, are compared.
+    cells
+        numbers of the root cells that hold anything, ascending.
+    """
+
+    def __init__(self, lattice: Lattice, points: Array, values: Array, fields: int, cells: Array) -> None:
+        local = np.clip(lattice.local(points), 0, lattice.size - 1e-6)
+        index = local.astype(np.int64) @ (1, int(lattice.size[0]), int(lattice.size[0] * lattice.size[1]))
+        member = np.minimum(np.searchsorted(cells, index), len(cells) - 1)
+        inside = cells[member] == index
+        self._local, self._member, self._true = local[inside], member[inside], values[inside, :fields]
+
+    def error(self, known: Array, share: Array, values: Array, coordinates: Array, level: int) -> Array:
+        """Errors (m,) of cells of a level, where so much is `known` (m,) without trials.
+
+        Parameters
+        ----------
+        known, share
+            errors of the cells (m,), and what their points count together (m,).
+        values, coordinates
+            corner values (m, 8, k), and places (m, 3).
+        level
+            of refinement.
+        """
+        if not len(self._member):
+            return known
+        squared = known**2
+        weights = trilinear(self._local * 2.0**level - coordinates[self._member])
+        found = np.einsum("nc,nck->nk", weights, values[self._member][..., : self._true.shape[1]]) - self._true
+        found = np.square(found).max(axis=1)
+        # What is said of cells is too little where those that count about as much err by more: many small cells have no trial of their own.
+        order = np.argsort(share[self._member], kind="stable")
+        groups = np.array_split(order, max(len(order) // _TRIALS_A_GROUP, 1))
+        low = np.array([share[self._member[group[0]]] for group in groups])
+        excess = np.array([max(found[group].sum() / max(squared[self._member[group]].sum(), 1e-30), 1.0) for group in groups])
+        squared = squared * excess[np.maximum(np.searchsorted(low, share, side="right") - 1, 0)]
+        count = np.bincount(self._member, minlength=len(known))
+        result: Array = np.sqrt((squared + np.bincount(self._member, found, len(known))) / (1 + count))
+        return result
+
+    def descend(self, split: Array, parents: Array, level: int) -> None:
+        """Move on to the children of the cells that are `split`, `parents` (n, 3) of a level; what lies in others is left behind."""
+        chosen = split[self._member]
+        self._local, self._true = self._local[chosen], self._true[chosen]
+        parent = (np.cumsum(split) - 1)[self._member[chosen]]
+        child = (self._local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[parent]
+        self._member = 8 * parent + child @ (1, 2, 4)
 
 
 class DeviceOctree:

@@ -37,6 +37,8 @@ MODES = ("fast", "reference")
 _MOST_SAMPLES = 1 << 20
 # What the fast mode stops at by itself: a scene whose noise is still too large then says so.
 _MOST_AUTOMATIC = 1024
+# The smallest error that can be asked for: what samples and walks add up is known to about six digits.
+_LEAST_ERROR = 1e-6
 # Where one sample a pixel takes more of what is left than this, each draws one direction from an environment.
 _DEAR = 0.4
 # Of a time limit, what predictions may take where walks correct them and where nothing does, and of the former what is left for them
@@ -243,13 +245,14 @@ class Renderer:
         Raises
         ------
         InputError
-            when `spp` is below 1 or above 1,048,576, `error` or `time_limit` is not positive, or what is to be audited is not interpolated.
+            when `spp` is below 1 or above 1,048,576, `error` is below a millionth, `time_limit` is not positive, or what is to be audited
+            is not interpolated.
         """
         scene, types = self.scene, self._types
         timed = error is None and time_limit is not None
         error = ERROR if error is None else error
-        if not error > 0:
-            raise InputError(f"error = {error}: give the noise to aim at as a share of the mean, for example {ERROR}")
+        if not error >= _LEAST_ERROR:
+            raise InputError(f"error = {error}: give the share of the mean to aim at, {_LEAST_ERROR} or more, for example {ERROR}")
         if time_limit is not None and not time_limit > 0:
             raise InputError(f"time = {time_limit:g}: give the seconds that the render may take, for example 10")
         if (audit or correct) and self.mode != "fast":

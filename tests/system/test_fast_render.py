@@ -196,7 +196,7 @@ def test_modes_and_errors_that_make_no_sense_are_refused(folder: Path) -> None:
     path = _file(folder, "haze")
     with pytest.raises(InputError, match="mode = 'slow'"):
         load(path, predictor=Smooth(), mode="slow")
-    for error in (0.0, -1.0, float("nan")):
+    for error in (0.0, -1.0, 1e-200, float("nan")):
         with pytest.raises(InputError, match="error ="):
             load(path, predictor=Smooth()).render(error=error)
 

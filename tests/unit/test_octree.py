@@ -71,6 +71,48 @@ def test_a_smaller_tolerance_gives_a_smaller_error_for_more_nodes() -> None:
     assert nodes[0] < nodes[1] < nodes[2]
 
 
+def test_trials_find_what_corners_do_not_tell() -> None:
+    """Rationale: a thin layer, of whose coarse cells all corners lie outside, and where the field is the same.
+
+    Expected: without trials these cells are taken for good, though they err by more than half; with them the error is about what
+    was asked for.
+    """
+
+    def layer(places: NDArray[np.float64]) -> NDArray[np.float32]:
+        z = ((places - CORNER) @ TURN)[:, 2]
+        value: NDArray[np.float32] = (1 + 3 * np.exp(-(((z - 0.3) / 0.015) ** 2)))[:, None].astype(np.float32)
+        return value
+
+    def within(n: int, seed: int) -> NDArray[np.float64]:
+        local = (_points(n, seed) - CORNER) @ TURN
+        # A small piece of it, so that all of the finest cells hold points.
+        result: NDArray[np.float64] = (local * (0.1, 0.1, 0.03) + (0.5, 0.5, 0.285)) @ TURN.T + CORNER
+        return result
+
+    points, others, drawn = within(8000, 13), within(4000, 14), within(256, 15)
+    tolerance, found = 0.05, []
+    for tried in (None, (drawn, layer(drawn))):
+        octree = Octree(_lattice(0.5), layer, points, np.ones(len(points)), tolerance, 10**6, 8, tried=tried)
+        assert octree.statistics.error < tolerance
+        found.append(float(np.sqrt(np.mean((_lookup(octree, others) - layer(others)) ** 2)) / layer(others).mean()))
+    without, with_them = found
+    assert without > 10 * tolerance
+    assert with_them < 2 * tolerance
+
+
+def test_trials_of_what_is_met_ask_for_no_more_nodes() -> None:
+    points, drawn = _points(8000, 16), _points(512, 17)
+    asked = []
+    for tried in (None, (drawn, _bump(drawn))):
+        octree = Octree(_lattice(0.25), _bump, points, np.ones(len(points)), 0.02, 10**6, 8, tried=tried)
+        found = _lookup(octree, points)
+        error = float(np.sqrt(np.mean((found - _bump(points)) ** 2, axis=0).max()) / _bump(points).mean(axis=0).max())
+        asked.append((octree.statistics.nodes, error))
+    (without, _), (with_them, error) = asked
+    assert error < 0.02
+    assert with_them < 1.3 * without
+
+
 def test_nodes_gather_where_the_function_bends() -> None:
     points = _points(8000, 5)
     asked: list[NDArray[np.float64]] = []
