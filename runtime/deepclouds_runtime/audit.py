@@ -36,6 +36,8 @@ WALKS_A_PIXEL, WALKS_A_SIGHT, FEWEST, MOST = 4, 32, 1 << 18, 1 << 22
 _FURTHER = 3
 # Judging, correcting and applying it take so many times as long as one correction; and how much of the time that is left a round may take.
 _CORRECTIONS, _PART = 10, 0.5
+# An error is reached where its square is below what was asked for by so many standard deviations: by one, an audit in five ends by chance.
+_SURE = 2.0
 # Least and most of the time left before an audit, but for one sample a pixel, that it may take. What walks leave, squared, falls with the
 # root of their time, noise with its power 3/2: the sum is least where noise has about a third of the time.
 _SHARE = (0.65, 0.9)
@@ -301,7 +303,7 @@ def audited(
         while True:
             clock = time.perf_counter()
             before, reached = judged()
-            if max(reached.squared, 0.0) + reached.squared_deviation <= error**2:
+            if max(reached.squared, 0.0) + _SURE * reached.squared_deviation <= error**2:
                 break
             # To judge once more and to apply a correction take about three times as long as to judge.
             ending = 3 * (time.perf_counter() - clock)
@@ -309,7 +311,7 @@ def audited(
                 break
             if correct and 1.1 * audit.count > limit:
                 # What is left, squared, falls with about the root of the number of walks.
-                enough = audit.count * (max(reached.squared, 0.0) / error**2) ** 2
+                enough = audit.count * ((max(reached.squared, 0.0) + reached.squared_deviation) / error**2) ** 2
                 limit = int(min(enough, _FURTHER * most, max(MOST, most)))
             # A last round that adds little tells nothing new.
             if 1.1 * audit.count > limit:

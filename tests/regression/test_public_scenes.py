@@ -68,13 +68,15 @@ def test_energy_on_a_public_scene(public_scenes: Path, name: str, energy: float)
 def test_error_of_a_corrected_image(public_scenes: Path, name: str) -> None:
     """Rationale: what the command line renders is corrected by walks.
 
-    Expected: the goals of docs/accuracy.md, 4 % and 1.5 %, each by its estimate; by the end of its interval half as much again at most.
+    Expected: the goals of docs/accuracy.md, 4 % and 1.5 %, each by its estimate of three seeds, whose walks differ; by the end of each one's
+    interval half as much again at most.
     """
     from deepclouds_runtime.loading import load
 
     renderer = load(public_scenes / name / "scene.xml", defines={"size": "96"})
-    report = report_of(public_scenes / name, renderer.render(SAMPLES[name], seed=4711, correct=True).rgb)
-    assert report.rrmse <= 0.04, report
-    assert abs(report.energy) <= 0.015, report
-    assert report.rrmse_interval[1] <= 0.06, report
-    assert max(abs(e) for e in report.energy_interval) <= 0.0225, report
+    reports = [report_of(public_scenes / name, renderer.render(SAMPLES[name], seed=seed, correct=True).rgb) for seed in (4711, 4712, 4713)]
+    assert float(np.sqrt(np.mean([report.rrmse**2 for report in reports]))) <= 0.04, reports
+    assert abs(float(np.mean([report.energy for report in reports]))) <= 0.015, reports
+    for report in reports:
+        assert report.rrmse_interval[1] <= 0.06, report
+        assert max(abs(e) for e in report.energy_interval) <= 0.0225, report

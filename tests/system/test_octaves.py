@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,15 @@ FLOOR = (
 )
 
 
+@pytest.fixture(autouse=True)
+def mi(llvm_mitsuba: ModuleType) -> ModuleType:
+    return llvm_mitsuba
+
+
 def scene_of(path: Path, size: int = 24) -> Any:
-    pytest.importorskip("mitsuba")
-    from deepclouds_runtime._mitsuba import mitsuba
     from deepclouds_runtime.loading import load_xml
     from deepclouds_runtime.scene import read_scene
 
-    mitsuba(select=True)
     return read_scene(load_xml(path, {"size": str(size)}))
 
 
