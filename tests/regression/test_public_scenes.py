@@ -68,8 +68,8 @@ def test_energy_on_a_public_scene(public_scenes: Path, name: str, energy: float)
 def test_error_of_a_corrected_image(public_scenes: Path, name: str) -> None:
     """Rationale: what the command line renders is corrected by walks.
 
-    Expected: the goals of docs/accuracy.md, 4 % and 1.5 %, each by its estimate of three seeds, whose walks differ; by the end of each one's
-    interval half as much again at most.
+    Expected: the goals of docs/accuracy.md, 4 % and 1.5 %, each by its estimate of three seeds, whose walks differ; by the end of the
+    interval of each half as much again at most.
     """
     from deepclouds_runtime.loading import load
 
