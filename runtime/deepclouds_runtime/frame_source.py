@@ -358,18 +358,19 @@ def interpolated(
     volume = field.volume
     edges = volume.to_world[:3, :3]
     lengths = np.linalg.norm(edges, axis=0)
+    # Splits between the coarsest cells and the finest that anybody can tell apart; where these are the larger ones, all are as large.
+    spacing = root * network.descriptor.unit
+    levels = _LEVELS if finest == 0 else math.floor(math.log2(spacing / finest) + 1)
+    spacing, levels = spacing * 2.0 ** max(-levels, 0), min(max(levels, 0), _LEVELS)
     # The error is measured where the octree was not built for: its points lie in the finest cells, the image lies in others too.
     held_out, built_for = _split(seen, min(checks, len(seen.points) // 2))
-    tried, built_for = _split(built_for, min(trials, len(built_for.points) // 2))
+    tried, built_for = _split(built_for, min(trials, len(built_for.points) // 2) if levels else 0)
     asked = np.concatenate([held_out.points, tried.points])
     paced = _Paced(evaluate, until)
     # The pace is that of the last call: the first one may have kernels to compile.
     parts = [paced(part) for part in np.array_split(asked, 1 if math.isinf(until) else 2) if len(part)]
     true = np.concatenate(parts) if parts else np.empty((0, 0))
-    spacing, most = root * network.descriptor.unit, min(overdrawn * nodes, max(paced.affordable(), _LEAST_CORNERS))
-    # Splits between the coarsest cells and the finest that anybody can tell apart; where these are the larger ones, all are as large.
-    levels = _LEVELS if finest == 0 else math.floor(math.log2(spacing / finest) + 1)
-    spacing, levels = spacing * 2.0 ** max(-levels, 0), min(max(levels, 0), _LEVELS)
+    most = min(overdrawn * nodes, max(paced.affordable(), _LEAST_CORNERS))
     while True:
         lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
         corners = root_nodes(lattice, seen.points, most)

@@ -62,6 +62,11 @@ class Lattice:
         """Coordinates of world points (n, 3) in root cells."""
         return (points - self.origin) @ self.axes / self.spacing
 
+    def number(self, local: Array) -> Array:
+        """Number of the root cell (n,) of each place (n, 3) in root cells."""
+        result: Array = local.astype(np.int64) @ (1, int(self.size[0]), int(self.size[0] * self.size[1]))
+        return result
+
     def world(self, local: Array) -> Array:
         """World points of coordinates (n, 3) in root cells."""
         return local * self.spacing @ self.axes.T + self.origin
@@ -176,9 +181,7 @@ class Octree:
         self._known: Array = np.empty((0, 0), np.float32)
         nx, ny, nz = (int(n) for n in lattice.size)
         local = np.clip(lattice.local(points), 0, lattice.size - 1e-6)
-        cell_of_point = local.astype(np.int64)
-        index = cell_of_point[:, 0] + nx * (cell_of_point[:, 1] + ny * cell_of_point[:, 2])
-        cells, some, member = np.unique(index, return_index=True, return_inverse=True)
+        cells, some, member = np.unique(lattice.number(local), return_index=True, return_inverse=True)
         # One of the points for each cell, that of its parent where it holds none.
         near = points[some]
         coordinates = np.stack([cells % nx, cells // nx % ny, cells // (nx * ny)], axis=1)
@@ -215,12 +218,9 @@ class Octree:
             self.statistics.cells.append(int(split.sum()))
             # The points of the split cells move on to the children. All eight are asked for: few more nodes than those that hold points,
             # and the image meets places that no point has tried.
-            chosen = split[member]
-            local, weights, member = local[chosen], weights[chosen], (np.cumsum(split) - 1)[member[chosen]]
-            points = points[chosen]
             parents, before, blocks = coordinates[split], values[split], int(split.sum())
-            child = (local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[member]
-            member = 8 * member + child @ (1, 2, 4)
+            chosen, member = _children(local, member, split, parents, level)
+            local, weights, points = local[chosen], weights[chosen], points[chosen]
             if trials is not None:
                 trials.descend(split, parents, level)
             coordinates = (2 * parents[:, None] + CORNERS).reshape(-1, 3)
@@ -344,7 +344,7 @@ class Octree:
         local = self.lattice.local(points)
         root = np.clip(np.floor(local), 0, size - 1)
         place = np.clip(local - root, 0, 1)
-        leaf: Array = self._table[root.astype(np.int64) @ (1, int(size[0]), int(size[0] * size[1]))].astype(np.int64)
+        leaf: Array = self._table[self.lattice.number(root)].astype(np.int64)
         while len(inner := np.flatnonzero(leaf < 0)):
             octant = (place[inner] >= 0.5).astype(np.int64)
             place[inner] = 2 * place[inner] - octant
@@ -369,7 +369,7 @@ class _Trials:
 
     def __init__(self, lattice: Lattice, points: Array, values: Array, fields: int, cells: Array) -> None:
         local = np.clip(lattice.local(points), 0, lattice.size - 1e-6)
-        index = local.astype(np.int64) @ (1, int(lattice.size[0]), int(lattice.size[0] * lattice.size[1]))
+        index = lattice.number(local)
         member = np.minimum(np.searchsorted(cells, index), len(cells) - 1)
         inside = cells[member] == index
         self._local, self._member, self._true = local[inside], member[inside], values[inside, :fields]
@@ -404,11 +404,8 @@ class _Trials:
 
     def descend(self, split: Array, parents: Array, level: int) -> None:
         """Move on to the children of the cells that are `split`, `parents` (n, 3) of a level; what lies in others is left behind."""
-        chosen = split[self._member]
+        chosen, self._member = _children(self._local, self._member, split, parents, level)
         self._local, self._true = self._local[chosen], self._true[chosen]
-        parent = (np.cumsum(split) - 1)[self._member[chosen]]
-        child = (self._local * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[parent]
-        self._member = 8 * parent + child @ (1, 2, 4)
 
 
 class DeviceOctree:
@@ -467,6 +464,18 @@ def _worst(squared: Array, allowed: float) -> Array:
     split = np.zeros(len(squared), bool)
     split[order[np.cumsum(squared[order]) > allowed]] = True
     return split
+
+
+def _children(local: Array, member: Array, split: Array, parents: Array, level: int) -> tuple[Array, Array]:
+    """Which places (n, 3) lie in cells that are `split`, and the numbers of the children that hold these.
+
+    `member` (n,) are the numbers of their cells of a level, `parents` (m, 3) the places of those that are split, whose children follow in
+    blocks of eight.
+    """
+    chosen = split[member]
+    parent = (np.cumsum(split) - 1)[member[chosen]]
+    child = (local[chosen] * 2.0 ** (level + 1)).astype(np.int64) - 2 * parents[parent]
+    return chosen, 8 * parent + child @ (1, 2, 4)
 
 
 def keys_of(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -51,10 +51,11 @@ def _nodes(image: RenderResult) -> int:
 
 def test_errors_may_be_larger_where_little_is_scattered_twice(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = load(ball, unbiased=True).render(512, 3)
-    found = load(ball, predictor=Smooth()).render(64, correct=True, error=0.005)
+    found = load(ball, predictor=Smooth()).render(64, correct=True)
+    fine = load(ball, predictor=Smooth()).render(64, correct=True, error=0.005)
     monkeypatch.setattr(pilot, "_THIN", 0.0)
     careful = load(ball, predictor=Smooth()).render(64, correct=True, error=0.005)
-    assert _nodes(found) < 0.5 * _nodes(careful)
+    assert _nodes(fine) < 0.5 * _nodes(careful)
     assert found.rgb.sum() == pytest.approx(paths.rgb.sum(), rel=0.005)
     tiles = [image.rgb.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)) for image in (found, paths)]
     assert float(np.sqrt(np.mean((tiles[0] - tiles[1]) ** 2)) / tiles[1].mean()) < 0.01
