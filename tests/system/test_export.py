@@ -11,7 +11,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from deepclouds_runtime.predictor import Predictor
+from deepclouds_runtime.predictor import MODELS, RELEASED, Predictor
 from deepclouds_training import export
 from deepclouds_training.network import Network, NetworkConfig
 from deepclouds_training.run_folder import RunFolder
@@ -144,3 +144,19 @@ def test_seeded_samples_cover_the_contract() -> None:
     assert hashlib.sha256(stencil.tobytes()).digest() == hashlib.sha256(export.seeded_samples(500)[0].tobytes()).digest()
     assert np.count_nonzero(aux[:, 0] == 0) > 50
     assert 150 < np.count_nonzero(aux[:, 3] == 1) < 350
+
+
+def test_no_weight_makes_subnormal_numbers() -> None:
+    torch.manual_seed(6)
+    network = Network(NetworkConfig(width=24))
+    with torch.no_grad():
+        for weights in network.parameters():
+            if weights.ndim == 2:
+                weights[:, 0] = 1e-39
+    files = [export.to_onnx(network), *(onnx.load(str(MODELS / f"{name}.onnx")) for name in RELEASED)]
+    for model in files:
+        for initialiser in model.graph.initializer:
+            values = np.abs(onnx.numpy_helper.to_array(initialiser).astype(np.float64))
+            assert not np.any((values > 0) & (values < 1e-30)), initialiser.name
+    stencil, aux = export.seeded_samples(64, seed=8)
+    assert export.parity(network, files[0].SerializeToString(), stencil, aux) < export.TOLERANCE

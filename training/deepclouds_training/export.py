@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 OPSET = 18
 TOLERANCE = 1e-4
 PARITY_SAMPLES = 2048
+# Weights below this count for nothing, but their products are subnormal numbers, which take some processors a hundred times as long.
+_LEAST_WEIGHT = 1e-30
 
 
 def main(argv: Sequence[str], prog: str = "deepclouds export") -> int:
@@ -170,7 +172,18 @@ def to_onnx(network: Network) -> Any:
     for value in (*model.graph.value_info, *model.graph.input, *model.graph.output, *model.graph.initializer):
         del value.metadata_props[:]
     del model.graph.metadata_props[:]
+    _zero_least_weights(model)
     return model
+
+
+def _zero_least_weights(model: Any) -> None:
+    from onnx import TensorProto, numpy_helper
+
+    for initialiser in model.graph.initializer:
+        if initialiser.data_type == TensorProto.FLOAT:
+            values = numpy_helper.to_array(initialiser)
+            kept = np.where(np.abs(values) < _LEAST_WEIGHT, np.float32(0), values)
+            initialiser.CopyFrom(numpy_helper.from_array(kept, initialiser.name))
 
 
 def parity(network: Network, data: bytes, stencil: NDArray[np.float32], aux: NDArray[np.float32]) -> float:
