@@ -189,7 +189,7 @@ def write_exr(
     Raises
     ------
     InputError
-        when a channel holds NaN or Inf (with the count), shapes differ, or an attribute cannot be stored.
+        when a channel holds NaN or Inf (with the count), shapes differ, an attribute cannot be stored, or the disk is full.
     """
     if not channels:
         raise InputError(f"{os.fspath(path)}: an image needs at least one channel")
@@ -217,10 +217,15 @@ def write_exr(
             raise InputError(f"{os.fspath(path)}: attribute '{key}' = {value} does not fit 32 bits; pass it as text")
         header[key] = value
 
-    with replacing(path, ".exr") as temporary, warnings.catch_warnings():
+    with _writing(path), replacing(path, ".exr") as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with openexr.File(header, pixels) as file:
             file.write(str(temporary))
+        # OpenEXR says nothing when its last bytes find no room.
+        try:
+            read_exr(temporary)
+        except InputError as error:
+            raise OSError("the file came out cut short") from error
 
 
 def write_png(path: str | os.PathLike[str], rgb: ArrayLike, exposure: float = 0.0) -> None:
@@ -241,7 +246,7 @@ def write_png(path: str | os.PathLike[str], rgb: ArrayLike, exposure: float = 0.
     Raises
     ------
     InputError
-        when the image has another shape or holds NaN or Inf.
+        when the image has another shape or holds NaN or Inf, or the disk is full.
     """
     image = np.asarray(rgb, dtype=np.float64)
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
@@ -269,8 +274,18 @@ def write_png_bytes(path: str | os.PathLike[str], pixels: NDArray[np.uint8]) -> 
     from PIL import Image
 
     picture = Image.fromarray(pixels)
-    with replacing(path, ".png") as temporary:
+    with _writing(path), replacing(path, ".png") as temporary:
         picture.save(temporary, format="PNG")
+
+
+@contextmanager
+def _writing(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Whatever a writer inside fails with, such as a full disk, is an InputError that names the file."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{os.fspath(path)}: cannot be written ({reason}); make room on the disk or choose another folder") from error
 
 
 def _openexr() -> ModuleType:

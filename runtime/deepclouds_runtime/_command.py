@@ -90,12 +90,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         required=True,
         help="image to write; for several frames with %%04d or #### in the place of their number (default: OUT.0001.exr, ...)",
     )
-    parser.add_argument("--spp", type=_positive, help="samples a pixel (default: as many as --error asks for)")
+    parser.add_argument("--spp", type=_positive, help="samples a pixel (default: as many as --error asks for); fewer where --time is over")
     parser.add_argument(
         "--error",
         type=float,
         help="error of a pixel to aim at, as a share of the mean: noise, and what a correction leaves "
-        f"(default 0.02; of several frames {ERROR_OF_FRAMES})",
+        f"(default 0.02; of several frames {ERROR_OF_FRAMES}); not with --mode reference",
     )
     parser.add_argument(
         "--audit", action="store_true", help="measure the network's error in this image with path-traced walks, and report it (fast mode)"
@@ -109,8 +109,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         "--time",
         type=float,
         metavar="SECONDS",
-        help=f"end in time; without --error all of it is used, in a corrected image of less than {_SHORT:g} seconds with the model 'fast'. "
-        "The image then depends on the machine",
+        help="end in time; without --error and --spp all of it is used, in a corrected image of less than "
+        f"{_SHORT:g} seconds with the model 'fast'. The image then depends on the machine",
     )
     parser.add_argument(
         "--mode", choices=("fast", "reference"), default="fast", help="reference: every sample asks the network (default %(default)s)"
@@ -197,6 +197,8 @@ _MAY_BE_NEGATIVE = ("--phase", "--sun", "--view", "--albedo", "--irradiance", "-
 def run(argv: Sequence[str], prog: str) -> int:
     """Parse `argv`, render and write; returns 0, or 130 when it was interrupted; raises InputError for bad input."""
     arguments = _parser(prog).parse_args(_negative_pairs(argv))
+    if arguments.mode == "reference" and arguments.error is not None:
+        raise InputError(f"--error {arguments.error:g}: the reference mode takes the samples of --spp, whatever their noise; leave it out")
     made = plan(arguments)
     options: dict[str, Any] = {
         k: getattr(arguments, k) for k in (*_VOLUME, *_BOTH, "sensor", "grid", "albedo_grid") if getattr(arguments, k) is not None

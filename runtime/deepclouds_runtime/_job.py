@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepclouds.errors import InputError
+from deepclouds.replacing import check_writable
 from deepclouds_runtime.sequence import VOLUMES, FileSequence, find_sequence, numbered
 
 if TYPE_CHECKING:
@@ -47,13 +48,6 @@ def plan(arguments: Namespace) -> Plan:
     """What the arguments ask for; raises InputError for frames that are missing and files that cannot be written."""
     output: Path = arguments.output
     png = None if arguments.png is None else Path(arguments.png or output.with_suffix(".png"))
-    for path, suffix in ((output, ".exr"), (png, ".png")):
-        if path is None:
-            continue
-        if path.suffix.lower() != suffix:
-            raise InputError(f"{path}: the name must end in {suffix}")
-        if not path.parent.is_dir():
-            raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
     inputs: Sequence[str] = arguments.input
     sequence = find_sequence(inputs)
     turn: int | None = arguments.turntable
@@ -62,7 +56,7 @@ def plan(arguments: Namespace) -> Plan:
     if sequence is None and turn is None:
         if arguments.frames is not None:
             raise InputError(f"{inputs[0]} is one file, so --frames has no meaning; write %04d or #### in the place of the number")
-        return Plan((Frame(None, inputs[0], output, png),), None, None)
+        return Plan(_writable((Frame(None, inputs[0], output, png),)), None, None)
     if sequence is not None:
         chosen, digits = sequence.chosen(arguments.frames), sequence.digits
     else:
@@ -80,7 +74,16 @@ def plan(arguments: Namespace) -> Plan:
         )
         for number in chosen
     )
-    return Plan(frames, sequence, turn)
+    return Plan(_writable(frames), sequence, turn)
+
+
+def _writable(frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    """The frames, once their files are known to be writable; raises InputError before any work is done."""
+    for frame in frames:
+        check_writable(frame.output, ".exr")
+        if frame.png is not None:
+            check_writable(frame.png, ".png")
+    return frames
 
 
 def corrects(arguments: Namespace, made: Plan) -> bool:
@@ -176,8 +179,8 @@ class _Job:
         self._renderer = None
         self._renderer = loading.load(frame.source, **self._load)
         if made.sequence is not None:
-            # The network is read once.
-            self._load["predictor"] = self._renderer.predictor
+            # The networks are read once, and every frame asks the same.
+            self._load |= {"predictor": self._renderer.predictor, "quick": self._renderer.quick}
         if made.turntable is not None:
             from deepclouds_runtime.turntable import Turntable
             from deepclouds_runtime.volume_scene import framed_corners
@@ -197,7 +200,8 @@ class _Job:
             self._turntable.turn(frame.number)
         if not self._described:
             _report.describe(renderer, say)
-        of_scene = _report.settings(renderer)
+        dial = self._dial(frame)
+        of_scene = _report.settings(renderer, dial["correct"])
 
         def write(result: RenderResult) -> None:
             given = {"input": frame.source, "frame": frame.number, "spp": result.statistics.spp}
@@ -205,11 +209,6 @@ class _Job:
 
         started = time.perf_counter() if self._described else self._started
         pictures = None if arguments.progressive is None else Pictures(write, arguments.progressive)
-        dial: dict[str, Any] = {"audit": arguments.audit, "correct": corrects(arguments, self._made), "time_limit": arguments.time}
-        if arguments.error is not None:
-            dial["error"] = arguments.error
-        elif frame.number is not None:
-            dial["error"] = ERROR_OF_FRAMES
         words = "rendering" if frame.number is None else f"frame {frame.number}{place}"
         with _progress(arguments.quiet, words) as (progress, estimate):
             result = renderer.render(
@@ -233,6 +232,18 @@ class _Job:
         elif self.complete:
             say(f"frame {frame.number}{place}: {time.perf_counter() - started:.1f} s, {_report.noise_words(result)}; wrote {named}")
         self._described = True
+
+    def _dial(self, frame: Frame) -> dict[str, Any]:
+        """What `Renderer.render` is told of error, time, and walks."""
+        arguments = self._arguments
+        dial: dict[str, Any] = {"audit": arguments.audit, "correct": corrects(arguments, self._made), "time_limit": arguments.time}
+        # Time alone is used up, and so is a number of paths.
+        alone = arguments.time is not None or (arguments.unbiased and arguments.spp is not None)
+        if arguments.error is not None:
+            dial["error"] = arguments.error
+        elif frame.number is not None and not alone:
+            dial["error"] = ERROR_OF_FRAMES
+        return dial
 
 
 def _finished(frame: Frame, say: Callable[[str], None]) -> bool:

@@ -77,13 +77,14 @@ def _measured(error: dict[str, Any]) -> str:
     )
 
 
-def settings(renderer: Renderer) -> dict[str, Any]:
-    """Of the scene, what is needed to render the image again."""
+def settings(renderer: Renderer, correct: bool = False) -> dict[str, Any]:
+    """Of the scene, what is needed to render the image again, one that walks `correct` or not."""
     import numpy as np
 
     from deepclouds_runtime._mitsuba import mitsuba
 
     scene = renderer.scene
+    asked = not renderer.traces(correct)
     parameters = mitsuba().traverse(scene.sensor)
     camera: dict[str, Any] = {
         "type": scene.sensor.class_name(),
@@ -102,11 +103,11 @@ def settings(renderer: Renderer) -> dict[str, Any]:
         "suns": [asdict(sun) for sun in scene.suns],
         "hide_emitters": scene.hide_emitters,
         "extinction": scene.scale,
-        "unit": renderer.unit,
+        "unit": renderer.unit if asked else None,
         "albedo": scene.albedo,
         "phase": scene.phase,
         "max_depth": scene.max_depth,
-        "model_hash": renderer.model_hash,
+        "model_hash": renderer.model_hash if asked else None,
     }
 
 

@@ -156,9 +156,12 @@ class Walks:
         wanted = share * (level + max(FLOOR * float(np.average(level, weights=share)), 1e-30))
         each = max(walks // GROUPS, 1)
         drawn, weights, groups = [], [], []
+        # Each group has one of every so many rays to itself, by chance: rays are spread evenly, and every so-many-th could meet the same
+        # columns of the image each time.
+        of_ray = np.argsort(random.random((len(looked.pixels) // GROUPS, GROUPS)), axis=1).ravel()
+        group_of = of_ray[seen.rays]
         for group in range(GROUPS):
-            # Each has every so-many-th ray to itself.
-            own_points = np.flatnonzero(seen.rays % GROUPS == group)
+            own_points = np.flatnonzero(group_of == group)
             if not len(own_points):
                 continue
             total = np.cumsum(wanted[own_points])
@@ -168,8 +171,8 @@ class Walks:
             weights.append(share[chosen_points] * (total[-1] / wanted[chosen_points]))
             groups.append(np.full(each, group))
         which = np.concatenate(drawn)
-        of_ray = seen.rays[which]
-        points, toward, pixels = seen.points.take(which, 0), looked.along.take(of_ray, 0), looked.pixels.take(of_ray)
+        rays = seen.rays[which]
+        points, toward, pixels = seen.points.take(which, 0), looked.along.take(rays, 0), looked.pixels.take(rays)
         return Drawn(points, toward, pixels, np.concatenate(groups), np.concatenate(weights), looked.predicted.take(which, 0), random)
 
     def begin(self, drawn: Drawn) -> Callable[[], Batch]:

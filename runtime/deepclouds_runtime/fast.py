@@ -14,7 +14,7 @@ import drjit as dr
 
 from deepclouds_runtime import stratified
 from deepclouds_runtime.frame_source import FrameSource
-from deepclouds_runtime.march import depths, gathered
+from deepclouds_runtime.march import OPAQUE, depths, gathered
 from deepclouds_runtime.stratified import Stratified
 from deepclouds_runtime.transport import (
     Cloud,
@@ -86,7 +86,7 @@ def fast_cloud_light(
         indirect = [a + b for a, b in zip(indirect, source.colours(values), strict=True)]
     dr.eval(hidden, tau, indirect, o, d, e)
     dr.scatter(result.opacity, hidden, lanes)
-    dr.scatter(result.transmittance, dr.exp(-tau), lanes)
+    dr.scatter(result.transmittance, dr.select(tau < OPAQUE, dr.exp(-tau), 0), lanes)
     for c in range(channels):
         dr.scatter(result.indirect[c], indirect[c], lanes)
     filled: Any = dr.compress(hidden > 0)

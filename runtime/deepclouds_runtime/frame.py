@@ -218,7 +218,8 @@ class Frame:
     @property
     def _of_image(self) -> Lights:
         """The lights, with what of them is interpolated in this camera's image."""
-        return replace(self.on_cloud, smooth=self._smooth)
+        # The same object each time, by which paths know what they have made for it.
+        return replace(self.on_cloud, smooth=self._smooth) if self._smooth else self.on_cloud
 
     def probed(self, corrected: bool) -> Cloud:
         """The cloud as those surfaces see it whose light goes on into the cloud: in images that walks correct that is path-traced."""
@@ -605,6 +606,9 @@ class Frame:
         look = None if scene.hide_emitters else background(types, scene.backdrop, scene.suns)
         if look is not None:
             sky, shines = look(direction)
+            glare = self._glare(sky, behind)
+            if glare is not None:
+                self._adaptive.dazzled[pixels] |= np.array(dr.block_sum(dr.select(glare, types.Float(1), 0), samples)) > 0
             self.film.add(*where, "background", [value * behind for value in sky])
             alpha = alpha + dr.select(shines, behind, 0)
             into = looks_into(types, scene.suns, direction)
@@ -612,6 +616,17 @@ class Frame:
                 self._adaptive.dazzled[pixels] |= np.array(dr.block_sum(dr.select(into, types.Float(1), 0), samples)) > 0
         self.film.add(*where, "A", [alpha])
         self.spent("surfaces and background", clock)
+
+    def _glare(self, sky: list[Any], behind: Any) -> Any:
+        """Whether rays see, past the cloud, what is bright of an environment: such pixels would be all that counts in the noise."""
+        environments = [source for source, _ in self.on_surfaces.sources if isinstance(source, Environment)]
+        if not environments:
+            return None
+        limit = dr.opaque(self.types.Float, BRIGHT * sum(environment.mean for environment in environments))
+        most = sky[0]
+        for value in sky[1:]:
+            most = dr.maximum(most, value)
+        return (most > limit) & (behind > 0.5)
 
     def _thrown(self, interaction: Any, weight: Any, numbers: Stratified) -> list[Any]:
         """Light of the cloud that surfaces send back, see `reflected_from_cloud`."""

@@ -22,7 +22,7 @@ from deepclouds.medium.field import Field
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds_runtime.lights import Beam, LightSource, Shade
 from deepclouds_runtime.march import depths
-from deepclouds_runtime.octree import DeviceOctree, Lattice, Octree, Statistics, lattice_around, root_nodes
+from deepclouds_runtime.octree import DeviceOctree, Lattice, Octree, Statistics, lattice_of, root_nodes
 from deepclouds_runtime.predicted import Predicted
 from deepclouds_runtime.scattering import NetworkScattering
 from deepclouds_runtime.scene_lights import Sun
@@ -39,6 +39,8 @@ _OVERDRAWN = 4
 _BEFORE = 0.99
 # Corners that the coarsest cells have at least, however short the time, and points that there is always time for.
 _LEAST_CORNERS, _UNLIMITED = 64, 1 << 62
+# From the seed of one beam's random numbers to the next one's.
+_STREAM = 0x9E3779B1
 
 
 @dataclass(frozen=True)
@@ -216,17 +218,20 @@ def from_source(types: Any, source: LightSource, count: int, plain: bool, seed: 
 def of_beams(types: Any, source: LightSource, beams: Sequence[Beam], plain: bool, seed: int) -> list[Arriving]:
     """Some of the beams of a light from all around."""
 
-    def of(beam: Beam) -> Arriving:
+    def of(beam: Beam, number: int) -> Arriving:
+        # Beams that share random numbers would err together.
+        own = (seed + number * _STREAM) & 0xFFFFFFFF
+
         def at(points: Any) -> list[Any]:
             n = dr.width(points)
             lanes = dr.arange(types.UInt32, n)
             one = dr.opaque(types.UInt32, 1)
-            numbers = Stratified(types, lanes, dr.zeros(types.UInt32, n), one, dr.opaque(types.UInt32, seed & 0xFFFFFFFF))
+            numbers = Stratified(types, lanes, dr.zeros(types.UInt32, n), one, dr.opaque(types.UInt32, own))
             return source.arriving_beam(points, beam, numbers.unrelated())
 
         return Arriving(beam.omega, beam.irradiance, at, plain)
 
-    return [of(beam) for beam in beams if max(beam.irradiance) > 0]
+    return [of(beam, number) for number, beam in enumerate(beams) if max(beam.irradiance) > 0]
 
 
 def from_beams(types: Any, source: LightSource, count: int) -> list[Arriving]:
@@ -371,12 +376,7 @@ def interpolated(
     parts = [paced(part) for part in np.array_split(asked, 1 if math.isinf(until) else 2) if len(part)]
     true = np.concatenate(parts) if parts else np.empty((0, 0))
     most = min(overdrawn * nodes, max(paced.affordable(), _LEAST_CORNERS))
-    while True:
-        lattice = lattice_around(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor)
-        corners = root_nodes(lattice, seen.points, most)
-        if corners <= most or lattice.size.max() <= 2:
-            break
-        spacing = max(spacing, lattice.spacing) * (max((corners / most) ** (1 / 3), 1.1) if network.anchor is None else 2.0)
+    lattice = lattice_of(lengths, volume.to_world[:3, 3], edges / lengths, spacing, network.anchor, seen.points, most)
     # Nothing is split where the corners take all there is.
     evaluate.on_lattice(lattice, levels if root_nodes(lattice, seen.points, 0) < nodes else 0)
     place = _BeforeSurfaces(field.types, shade) if shade is not None and shade.surfaces is not None else None

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepclouds.errors import InputError
-from deepclouds.volume import read_volume
+from deepclouds.volume import Volume, read_volume
 from deepclouds.volume.pyramid import mean_extinction, volume_frame
-from deepclouds_runtime.volume_scene import VolumeOptions, extinction, framed_corners
+from deepclouds_runtime.volume_scene import VolumeOptions, check, extinction, framed_corners
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,15 @@ def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = N
     Raises
     ------
     InputError
-        when all key frames are empty, and for what the readers refuse.
+        for options out of range, when all key frames are empty, and for what the readers refuse.
     """
+    check(options)
     scales, masses, means, corners = [], [], [], []
     origin = None
     for file in files:
-        volume = read_volume(file, grid, clamp)
-        mean = mean_extinction(volume)
-        if mean == 0:
+        volume = read_frame(file, grid, clamp)
+        mean = 0.0 if volume is None else mean_extinction(volume)
+        if volume is None or mean == 0:
             continue
         if origin is None:
             origin = volume_frame(volume).origin
@@ -77,6 +78,21 @@ def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = N
     scale = min(scales)
     mean = float(np.average(means, weights=masses)) * scale
     return Fixed(scale, 1 / mean if mean > 0 else 1.0, origin, np.concatenate(corners))
+
+
+def read_frame(file: Path, grid: str | None = None, clamp: bool = False) -> Volume | None:
+    """The density of one frame of a sequence; None where its grid has no active voxel, and so not even a box."""
+    try:
+        return read_volume(file, grid, clamp)
+    except InputError as error:
+        if str(error).endswith("is empty: it has no active voxel"):
+            return None
+        raise
+
+
+def without_cloud(fixed: Fixed) -> Volume:
+    """What stands for a frame without a voxel: an empty box around what the camera frames."""
+    return Volume.from_box(np.zeros((2, 2, 2), np.float32), fixed.corners.min(axis=0), fixed.corners.max(axis=0))
 
 
 def with_extinction(options: VolumeOptions, fixed: Fixed) -> VolumeOptions:

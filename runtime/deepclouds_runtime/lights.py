@@ -255,12 +255,19 @@ class Environment:
             self._bright_parts[times] = self._part(times)
         return self._bright_parts[times]
 
-    def _part(self, times: float) -> BrightPart | None:
+    @property
+    def mean(self) -> float:
+        """Mean luminance of all directions."""
         rows, columns = self._shape
         edges = np.cos(np.linspace(0, np.pi, rows + 1))
         power = luminance(self._colours) * (edges[:-1] - edges[1:])[:, None]
-        # The mean over the sphere, whose solid angle is that of two for the edges' cosines.
-        bright = luminance(self._colours) > times * power.sum() / (2 * columns)
+        # The sphere's solid angle is that of two for the edges' cosines.
+        return float(power.sum() / (2 * columns))
+
+    def _part(self, times: float) -> BrightPart | None:
+        rows, columns = self._shape
+        edges = np.cos(np.linspace(0, np.pi, rows + 1))
+        bright = luminance(self._colours) > times * self.mean
         if not bright.any():
             return None
         colours = np.where(bright[..., None], self._colours, 0)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from deepclouds.errors import InputError
 from deepclouds.medium.albedo import AlbedoGrid
 from deepclouds.volume import read_volume
 from deepclouds_runtime._mitsuba import mitsuba
-from deepclouds_runtime.key_frames import Fixed, with_extinction
+from deepclouds_runtime.key_frames import Fixed, read_frame, with_extinction, without_cloud
 from deepclouds_runtime.lights import luminance
 from deepclouds_runtime.renderer import Renderer
 from deepclouds_runtime.scattering import Predicts
@@ -38,6 +38,7 @@ def load(
     defines: Mapping[str, str] | None = None,
     model: str | PathLike[str] | None = None,
     predictor: Predicts | None = None,
+    quick: Callable[[], Predicts] | None = None,
     threads: int | None = None,
     grid: str | None = None,
     clamp: bool = False,
@@ -60,6 +61,8 @@ def load(
         small one about light from all around.
     predictor
         any object with ``predict``, in place of `model`.
+    quick
+        with `predictor`: loads a quicker one, see `Renderer`.
     threads
         threads for everything; None takes all cores.
     grid, clamp
@@ -103,13 +106,13 @@ def load(
     if threads is not None:
         _set_threads(threads)
     scene = _scene(source, path, dict(defines or {}), grid, clamp, albedo_grid, ignore_emission, fixed, turn, options)
-    quick = None
     if predictor is None and scene.max_depth != 2 and not how.get("unbiased"):
         from deepclouds_runtime.predictor import RELEASED, Predictor
 
         predictor = Predictor(None if model is None else fspath(model), threads)
         if model in (None, RELEASED[0]) and (scene.environment is not None or scene.surfaces is not None):
-            quick = partial(Predictor, RELEASED[-1], threads)
+            # Frames of a sequence share it.
+            quick = cache(partial(Predictor, RELEASED[-1], threads))
     if fixed is not None:
         how = {"unit": fixed.unit, "origin": fixed.origin, **how}
     return Renderer(scene, predictor, quick, load_seconds=time.perf_counter() - started, **how)
@@ -141,8 +144,11 @@ def _scene(
         if defines:
             raise InputError(f"{path}: -D{next(iter(defines))} has no meaning for a volume; it sets a parameter of a scene file")
         wanted = options_from(options)
-        varying = None if albedo_grid is None else _albedo(path, albedo_grid, "albedo" in options)
-        volume = read_volume(path, grid, clamp)
+        volume = read_volume(path, grid, clamp) if fixed is None else read_frame(path, grid, clamp)
+        varying = None if albedo_grid is None or volume is None else _albedo(path, albedo_grid, "albedo" in options)
+        if volume is None:
+            assert fixed is not None
+            volume = without_cloud(fixed)
         notes = _left_out(path, grid, albedo_grid, ignore_emission)
         if fixed is None:
             scene = volume_scene(volume, wanted, str(path), turn=turn)
@@ -160,7 +166,13 @@ def _scene(
         raise InputError(
             f"{path or 'the scene'}: grid, clamp, albedo_grid and ignore_emission belong to a volume; a scene says itself what it reads"
         )
-    return read_scene(source if path is None else load_xml(path, defines), **options)
+    if path is None:
+        return read_scene(source, **options)
+    scene = load_xml(path, defines)
+    try:
+        return read_scene(scene, **options)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _albedo(path: Path, grid: str, given: bool) -> AlbedoGrid:

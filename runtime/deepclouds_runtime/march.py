@@ -14,8 +14,9 @@ from deepclouds.medium.field import Field
 from deepclouds_runtime.octree import DeviceOctree
 from deepclouds_runtime.transport import depth_of, opacity_of, taker
 
-# The share of light that is left behind this depth is below a float32's digits of what came before it.
-_OPAQUE = 16.0
+# The share of light that is left behind this depth is below a float32's digits of what came before it. Nothing is seen through it: what
+# lies behind may be a sun.
+OPAQUE = 16.0
 
 
 @dr.syntax
@@ -61,7 +62,7 @@ def gathered(
                 sums[i][k] += dr.select(filled, share * values[k], 0)
         tau += depth
         distance = after
-        going = going & (distance < cells.last) & (tau < _OPAQUE)
+        going = going & (distance < cells.last) & (tau < OPAQUE)
     return tau, sums
 
 

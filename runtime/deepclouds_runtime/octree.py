@@ -112,6 +112,18 @@ def lattice_around(lengths: Array, corner: Array, axes: Array, spacing: float, a
     return Lattice(corner - axes @ (0.5 * (size * spacing - lengths)), axes, spacing, size)
 
 
+def lattice_of(lengths: Array, corner: Array, axes: Array, spacing: float, anchor: Array | None, points: Array, most: int) -> Lattice:
+    """`lattice_around`, of cells as much larger as it takes for `most` corners around points (n, 3), or of the largest there are."""
+    lattice = lattice_around(lengths, corner, axes, spacing, anchor)
+    while (corners := root_nodes(lattice, points, most)) > most:
+        wider = lattice.spacing * (max((corners / most) ** (1 / 3), 1.1) if anchor is None else 2.0)
+        larger = lattice_around(lengths, corner, axes, wider, anchor)
+        if larger.spacing <= lattice.spacing * (1 + 1e-6):
+            break
+        lattice = larger
+    return lattice
+
+
 def root_nodes(lattice: Lattice, points: Array, enough: int) -> int:
     """Corners of the root cells that hold world points (n, 3); a bound on their number where that is at most `enough`."""
     bound = int(np.prod(lattice.size + 1))

@@ -244,4 +244,4 @@ def _tint(lights: Sequence[Arriving]) -> Array | None:
         return None
     irradiance = np.array([light.irradiance for light in lights], np.float64)
     tint = irradiance[0] / irradiance[0].max()
-    return tint if np.allclose(irradiance, irradiance.max(axis=1, keepdims=True) * tint, rtol=1e-5) else None
+    return tint if np.allclose(irradiance, irradiance.max(axis=1, keepdims=True) * tint, rtol=1e-5, atol=0) else None

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ from deepclouds_runtime.rounds import Watch, fixed_rounds, rounds_for_error, say
 from deepclouds_runtime.scattering import NetworkScattering, Predicts, Stopped
 from deepclouds_runtime.scene import CloudScene
 from deepclouds_runtime.transport import Cloud, Counts, Lights
+
+_LOG = logging.getLogger(__name__)
 
 MODES = ("fast", "reference")
 # A pixel's samples are in flight together.
@@ -91,9 +94,9 @@ class Renderer:
     notes
         what was approximated in reading the scene, and what of its medium the model was not trained on, in sentences.
     model_hash
-        of the weights that are asked, or None.
-    predictor
-        the network that was given.
+        of the weights that are asked, or None; images that `traces` tells of ask none.
+    predictor, quick
+        the network that was given, and what loads the quicker one.
 
     Raises
     ------
@@ -165,7 +168,7 @@ class Renderer:
                 "each sample, noisy and slow"
             )
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
-        self._quick = quick
+        self.quick = quick
         self.model_hash: str | None = None
         if self._network is not None and not self._unknown:
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
@@ -174,15 +177,19 @@ class Renderer:
     @cached_property
     def _quicker(self) -> NetworkScattering | None:
         """The quicker network, where there is one that was trained on the scene's medium."""
-        if self._quick is None or self._network is None or self._unknown:
+        if self.quick is None or self._network is None or self._unknown:
             return None
-        predictor = self._quick()
+        predictor = self.quick()
         return None if _unknown(self._network, predictor, self.scene) else self._network.asking(predictor)
 
     @property
     def unit(self) -> float | None:
         """Unit of length of the network's input, world units; None where no network is asked."""
         return None if self._network is None or self._unknown else self._network.descriptor.unit
+
+    def traces(self, correct: bool) -> bool:
+        """Whether an image, one that walks `correct` or not, is path-traced, and so asks no network."""
+        return self._walks or ((self._albedo is not None or self._unknown) and not correct and self.scene.max_depth != 2)
 
     def samples(self, spp: int | None) -> int:
         """Samples a pixel of a render that is asked for `spp`; for None those of the camera's sampler."""
@@ -212,8 +219,9 @@ class Renderer:
         Parameters
         ----------
         spp
-            samples a pixel. By default the fast mode takes as many as `error` asks for, the reference mode those of the camera's sampler,
-            which is also the most that paths take that nobody asked for (`extrapolate`).
+            samples a pixel; fewer where the time is over, or in an unbiased render the noise as small as an `error` that is given. By
+            default the fast mode takes as many as `error` asks for, the reference mode those of the camera's sampler, which is also the
+            most that paths take that nobody asked for (`extrapolate`).
         seed
             of all random numbers.
         progress
@@ -240,7 +248,7 @@ class Renderer:
             cloud throws on surfaces is corrected by one number a channel.
         time_limit
             seconds: the audit ends where samples will need the rest, by a trial of a few; they end with the last round that should end in
-            time. The result then depends on the machine.
+            time, or once there are `spp`. The result then depends on the machine.
 
         Raises
         ------
@@ -249,7 +257,9 @@ class Renderer:
             is not interpolated.
         """
         scene, types = self.scene, self._types
-        timed = error is None and time_limit is not None
+        # What ends a number of samples early: an adaptive image has as many as are asked for, whatever the noise.
+        target = error if self.unbiased else None
+        timed = error is None and time_limit is not None and spp is None
         error = ERROR if error is None else error
         if not error >= _LEAST_ERROR:
             raise InputError(f"error = {error}: give the share of the mean to aim at, {_LEAST_ERROR} or more, for example {ERROR}")
@@ -269,7 +279,9 @@ class Renderer:
         gc.collect()
         watch = Watch(progress, partial, interrupted, estimate)
         adaptive = self.mode == "fast"
-        walks = self._walks or ((self._albedo is not None or self._unknown) and not correct and scene.max_depth != 2)
+        walks = self.traces(correct)
+        if audit and walks:
+            _say_nothing_to_audit()
         paths = Paths(self._field, scene.albedo, scene.phase, self._albedo, seed) if walks else None
         scattering = None if walks else self._network
         # Whether rays end in a walk or a query of their own; otherwise multiple scattering of the fast mode is interpolated.
@@ -302,6 +314,8 @@ class Renderer:
             until = math.inf
             if time_limit is not None:
                 one, all_of_them = frame.sampling_seconds(error)
+                if spp is not None:
+                    all_of_them = most * one
                 now = time.perf_counter()
                 left = started + time_limit - now
                 if one > _DEAR * left:
@@ -315,14 +329,14 @@ class Renderer:
         def so_far(noise: float) -> RenderResult:
             return self._result(frame, started, noise, False)
 
+        end = math.inf if time_limit is None else started + time_limit
         if spp is not None or not adaptive:
-            noise, stopped = fixed_rounds(frame, most, error, watch, so_far)
+            noise, stopped = fixed_rounds(frame, most, error, watch, so_far, target, end)
         else:
             # Paths that nobody asked for stop at the scene's own number.
             if (own := int(scene.sensor.sampler().sample_count())) != most:
                 say_ignored(None if timed else error, own)
             # Blocks that rested because their paths found little light by chance would make an unbiased image dark.
-            end = math.inf if time_limit is None else started + time_limit
             goal = _TIMED * error if timed and not walks else frame.noise_goal(error)
             noise, stopped = rounds_for_error(frame, most, None if timed else goal, goal, end, not walks, watch, so_far)
         return self._result(frame, started, noise, not stopped)
@@ -402,7 +416,7 @@ class Renderer:
             statistics.noise,
             [(source.error, source.level) for source in frame.sources or []],
             indirect / whole if whole > 0 else 0.0,
-            self._network is not None and not self._unknown and frame.sources != [],
+            self._network is not None and not self._unknown and frame.cloud.paths is None and frame.sources != [],
             frame.found,
             statistics.network,
             getattr(getattr(self.predictor, "metadata", None), "metrics", {}),
@@ -416,6 +430,12 @@ class Renderer:
         if self.scene.environment is not None:
             sources.append((environment(self._types, self.scene.environment, shade), self.environment_directions))
         return Lights(self.scene.suns, tuple(sources), shade)
+
+
+@cache
+def _say_nothing_to_audit() -> None:
+    """Say that an audit finds no network, once for all frames of a sequence."""
+    _LOG.info("nothing to audit: multiple scattering is path-traced, and no network is asked")
 
 
 def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene) -> list[str]:

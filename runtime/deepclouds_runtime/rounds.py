@@ -33,28 +33,62 @@ class Watch:
         return self.interrupted is not None and self.interrupted()
 
 
-def fixed_rounds(frame: Frame, most: int, error: float, watch: Watch, so_far: SoFar) -> tuple[float, bool]:
+def fixed_rounds(
+    frame: Frame,
+    most: int,
+    error: float,
+    watch: Watch,
+    so_far: SoFar,
+    target: float | None = None,
+    end: float = math.inf,
+) -> tuple[float, bool]:
     """Take `most` samples of every pixel; returns the noise, as far as it is known, and whether somebody stopped it.
 
-    In rounds that double their number where somebody watches, else all at once: the samples are the same.
+    In rounds that double their number where somebody watches, else all at once: the samples are the same. With a `target` for the noise, or
+    an `end` of the time, in seconds of `time.perf_counter`, it takes fewer where that is reached first: rounds are cut so that they should
+    end in time, and one sample there is in any case.
     """
-    noise = math.inf
-    if watch.partial is None and watch.interrupted is None:
+    noise, growth = math.inf, 2.0
+    may_end = target is not None or not math.isinf(end)
+    if watch.partial is None and watch.interrupted is None and not may_end:
         frame.round(0, most, most, watch.progress)
         return noise, False
-    frame.round(0, 1, most, watch.progress)
-    while frame.samples < most:
+    # The first of a known number of samples lie at the near end of what is spread over all of them: what may be cut is open-ended.
+    known, progress = (0, None) if may_end else (most, watch.progress)
+    started = time.perf_counter()
+    frame.round(0, 1, known, progress)
+    pace = max(time.perf_counter() - started, 1e-6)
+    while frame.samples < most and (target is None or not noise <= target):
         if watch.stops:
             return noise, True
-        before, done = frame.film.beauty(), frame.samples
+        done = frame.samples
+        more = _in_time(min(math.ceil(done * (growth - 1)), most - done), end, pace)
+        if more < 1:
+            break
+        before = frame.film.beauty()
         if watch.partial is not None:
             watch.partial(so_far(noise))
-        if frame.round(done, min(done, most - done), most, watch.progress, watch.interrupted):
+        clock = time.perf_counter()
+        if frame.round(done, more, known, progress, watch.interrupted):
             return noise, True
-        noise, _ = frame.settle(before, done, error, rest=False)
+        pace = max(time.perf_counter() - clock, 1e-6) / more
+        noise, wanted = frame.settle(before, done, error, rest=False)
+        if target is not None:
+            growth = wanted
         if watch.estimate is not None:
             watch.estimate(noise)
+        if may_end and watch.progress is not None:
+            of_error = 0.0 if target is None else (target / max(noise, 1e-9)) ** 2
+            watch.progress(min(max(frame.samples / most, of_error, (time.perf_counter() - started) / (end - started)), 1.0))
     return noise, False
+
+
+def _in_time(more: int, end: float, pace: float) -> int:
+    """So many of `more` samples as should be done before the `end`, at `pace` seconds each."""
+    if math.isinf(end):
+        return more
+    left = end - time.perf_counter()
+    return min(more, int(left / pace)) if left > 0 else 0
 
 
 def rounds_for_error(
@@ -84,10 +118,7 @@ def rounds_for_error(
         if watch.stops:
             return noise, True
         done = frame.samples
-        more = min(math.ceil(done * (growth - 1)), most - done)
-        if not math.isinf(end):
-            left = end - time.perf_counter()
-            more = min(more, int(left / pace)) if left > 0 else 0
+        more = _in_time(min(math.ceil(done * (growth - 1)), most - done), end, pace)
         if more < 1:
             break
         before = frame.film.beauty()

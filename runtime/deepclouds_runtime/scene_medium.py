@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +51,7 @@ def read_medium(container: Any) -> Medium:
     parameters = mi.traverse(medium)
     check_dark(parameters.keys())
     scale = float(np.ravel(parameters["scale"])[0]) if "scale" in parameters else 1.0
+    _check_range("scale", [scale])
     if "sigma_t.data" in parameters:
         data = np.array(parameters["sigma_t.data"])
         if data.ndim == 4 and data.shape[3] != 1:
@@ -62,11 +64,20 @@ def read_medium(container: Any) -> Medium:
         volume = locate(density, scale, _grid_boxes(container, medium), lambda p: _coefficients(medium, p)[1])
         _check_cover(container, volume)
     else:
+        if "sigma_t.value.value" in parameters:
+            _check_range("sigma_t", np.ravel(np.array(parameters["sigma_t.value.value"])).tolist())
         volume, scale = _homogeneous(container, medium)
     if "albedo.data" in parameters:
         varying = _varying_albedo(container, medium, np.array(parameters["albedo.data"]), volume)
         return Medium(volume, scale, varying.largest, phase, varying)
     return Medium(volume, scale, _read_albedo(parameters), phase)
+
+
+def _check_range(name: str, values: Sequence[float], most: float = math.inf) -> None:
+    """Refuse, by InputError, values of a medium's parameter that are no numbers from 0 to `most`."""
+    if not all(math.isfinite(value) and 0 <= value <= most for value in values):
+        remedy = "a finite number that is not negative" if math.isinf(most) else f"values in 0 to {most:g}"
+        raise InputError(f"the medium's {name} = {', '.join(f'{value:g}' for value in values)}: give {remedy}")
 
 
 def check_dark(names: Iterable[str]) -> None:
@@ -226,5 +237,6 @@ def _read_albedo(parameters: Any) -> tuple[float, ...]:
     for name in names:
         value = np.ravel(np.array(parameters[name])).astype(np.float64)
         if value.size in (1, channels):
+            _check_range("albedo", value.tolist(), 1)
             return tuple(float(v) for v in np.broadcast_to(value, channels))
     raise InputError("the medium's albedo has no constant value; use <rgb name='albedo' .../> or a float")

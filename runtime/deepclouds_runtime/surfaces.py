@@ -10,6 +10,7 @@ import numpy as np
 
 from deepclouds.medium.optical_depth import optical_depth
 from deepclouds.medium.phase import rotate_to, sample_two_lobe_cosine, two_lobe
+from deepclouds.medium.walk_parts import direction_around
 from deepclouds_runtime import stratified
 from deepclouds_runtime._mitsuba import channels, mitsuba, plain
 from deepclouds_runtime.disc import Disc, discs
@@ -159,9 +160,11 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
     axis = types.Array3f(*(dr.opaque(types.Float, float(v)) for v in 0.5 * (lower + upper))) - plain(types, interaction.p)
     distance = dr.norm(axis)
     axis = axis / dr.maximum(distance, 1e-20)
-    # From inside of the sphere the cone is the whole sphere of directions.
-    widest = dr.select(distance > radius, dr.safe_sqrt(1 - dr.square(radius / distance)), -1.0)
-    of_cone = dr.rcp(2 * dr.pi * dr.maximum(1 - widest, 1e-7))
+    # From inside of the sphere the cone is the whole sphere of directions. From far away its edge's cosine is 1 but for the last digits:
+    # the sine tells it, and one minus the cosine.
+    outside, sine = distance > radius, radius / dr.maximum(distance, radius)
+    beside = dr.select(outside, dr.square(sine) / (1 + dr.safe_sqrt(1 - dr.square(sine))), 2.0)
+    of_cone = dr.rcp(2 * dr.pi * dr.maximum(beside, 1e-30))
 
     pick = numbers.number(stratified.SURFACE_W)
     u, v = numbers.number(stratified.SURFACE_U), numbers.number(stratified.SURFACE_V)
@@ -171,13 +174,14 @@ def reflected_from_cloud(cloud: Cloud, lights: Lights, interaction: Any, weight:
     aim, bounce = pick < half, (pick >= half) & (pick < 2 * half)
     rest = dr.clip((pick - half) / half, 0, 0.99999994)
     # Around the axis: cosine uniform between that of the cone's edge and 1.
-    aimed = rotate_to(axis, 1 - u * (1 - widest), 2 * dr.pi * v)
+    aimed = direction_around(axis, u * beside, v)
     sample, sampled = bsdf.sample(context, interaction, mi.Float(rest), mi.Point2f(u, v), valid)
     omega = dr.select(aim, aimed, plain(types, interaction.to_world(sample.wo)))
     if halo is not None:
         omega = dr.select(aim | bounce, omega, halo.sample(dr.clip((pick - 2 * half) / of_halo, 0, 0.99999994), u, v))
     local = interaction.to_local(mi.Vector3f(omega))
-    density = half * (plain(types, bsdf.pdf(context, interaction, local, valid)) + dr.select(dr.dot(omega, axis) >= widest, of_cone, 0))
+    meets = aim | ~outside | ((dr.norm(dr.cross(omega, axis)) <= sine) & (dr.dot(omega, axis) > 0))
+    density = half * (plain(types, bsdf.pdf(context, interaction, local, valid)) + dr.select(meets, of_cone, 0))
     if halo is not None:
         density += of_halo * halo.density(omega)
     # A mirror's direction has no density: it is taken as often as the BSDF is asked.

@@ -159,7 +159,8 @@ def cloud_light(
     opacity = opacity_of(tau)
     target = depth_of(numbers.number(stratified.DEPTH) * opacity)
     distance = distance_at(medium, origin, direction, types.Float(0), end, target, tau > 0)
-    result = CloudLight(opacity, dr.exp(-tau), distance)
+    # Optical depths end there, and what lies behind may be a sun.
+    result = CloudLight(opacity, dr.select(tau < TAU_OPAQUE, dr.exp(-tau), 0), distance)
     channel_count = len(cloud.albedo)
     result.direct = [dr.zeros(types.Float, n) for _ in range(channel_count)]
     result.indirect = [dr.zeros(types.Float, n) for _ in range(channel_count)]

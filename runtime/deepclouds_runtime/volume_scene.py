@@ -120,7 +120,7 @@ def volume_scene(
     InputError
         for values outside of their range, a missing environment map, and an optical depth asked of an empty volume.
     """
-    _check(options)
+    check(options)
     mi = mitsuba()
     scale = extinction(volume, options, source)
     try:
@@ -245,7 +245,9 @@ def _three(values: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(float(v) for v in (values * 3 if len(values) == 1 else values))
 
 
-def _check(options: VolumeOptions) -> None:
+def check(options: VolumeOptions) -> None:
+    """Refuse, by InputError, what is out of range or contradicts itself."""
+
     def refuse(name: str, remedy: str) -> None:
         raise InputError(f"{name} = {getattr(options, name)}: {remedy}")
 

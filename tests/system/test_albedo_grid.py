@@ -6,6 +6,8 @@ stays darker; what does not fit is refused with exit code 2.
 
 from __future__ import annotations
 
+import json
+import logging
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 from deepclouds_runtime._mitsuba import mitsuba
 from deepclouds_runtime.loading import load
+from deepclouds_runtime.renderer import _say_nothing_to_audit
 from numpy.typing import NDArray
 
 from deepclouds.cli import main
@@ -120,3 +123,24 @@ def test_a_corrected_image_asks_the_network_and_is_that_of_paths(tmp_path: Path)
     assert noise < 0.15
     assert error < 0.03
     np.testing.assert_allclose(ours.mean(axis=(0, 1)), mean.mean(axis=(0, 1)), rtol=0.015)
+
+
+def test_images_that_are_path_traced_name_no_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    _say_nothing_to_audit.cache_clear()
+    fixed = ["render", str(PAINTED), "-o", str(tmp_path / "image.exr"), "--albedo-grid", "Cd", "--size", "8x6", "--spp", "1"]
+    headers = []
+    for flags, name in (([], "image"), (["--audit"], "image"), (["--turntable", "2", "--frames", "2"], "image.0002")):
+        caplog.clear()
+        assert main([*fixed, *flags]) == 0
+        said = capsys.readouterr().out
+        assert ("--audit" in said, "none was asked" in said) == (False, flags == ["--audit"])
+        nothing = "nothing to audit: multiple scattering is path-traced, and no network is asked"
+        assert (nothing in caplog.messages) == (flags == ["--audit"])
+        attributes = read_exr(tmp_path / f"{name}.exr").attributes
+        headers.append(json.loads(str(attributes["deepclouds"])))
+        assert ("modelHash" in attributes, "model_hash" in headers[-1], "unit" in headers[-1]) == (flags == [],) * 3
+    assert [h["statistics"]["mode"] for h in headers] == ["fast", "path-traced", "path-traced"]
+    assert [h["statistics"]["error"]["network"]["by"] for h in headers] == ["walks", "none", "none"]

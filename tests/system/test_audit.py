@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 from deepclouds_runtime import correction, frame
 from deepclouds_runtime.audit import FEWEST
-from deepclouds_runtime.audit_walks import Batch, Drawn, Walks
+from deepclouds_runtime.audit_walks import Batch, Drawn, Looked, Walks
 from deepclouds_runtime.correction import GROUPS, Correction, Sums
+from deepclouds_runtime.frame_source import Seen
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.output import save
 from deepclouds_runtime.render import main
@@ -202,6 +203,21 @@ def test_groups_of_walks_share_no_point(scene: Path, monkeypatch: pytest.MonkeyP
         for values, tolerance in ((batch.predicted, 0.02), (batch.walked, 0.1)):
             means = [float((batch.weights[:, None] * values)[batch.groups == group].mean()) for group in range(GROUPS)]
             assert means == pytest.approx([float(np.mean(means))] * GROUPS, rel=tolerance)
+
+
+def test_groups_of_walks_see_all_columns() -> None:
+    """Rays are spread evenly over the rows: every fourth of them would meet the same columns in every row where a row has 32 rays."""
+    random = np.random.default_rng(3)
+    rays = 1 << 15
+    rows, columns = rays // 32, np.arange(rays) % 32
+    nothing = np.zeros((rays, 3))
+    seen = Seen(np.stack([columns, *np.zeros((2, rays))], axis=1), np.full(rays, 1 / rows), np.arange(rays))
+    looked = Looked(seen, nothing, np.arange(rays), np.ones((rays, 1)), random)
+    drawn = Walks.drawn(looked, rays)
+    for group in range(GROUPS):
+        number = np.bincount(drawn.points[drawn.groups == group, 0].astype(int), minlength=32)
+        assert number.min() > 0.7 * number.mean()
+        assert number.max() < 1.3 * number.mean()
 
 
 def test_a_cloud_far_away_is_corrected_as_well(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

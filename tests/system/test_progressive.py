@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import deepclouds_runtime
 import numpy as np
@@ -71,6 +72,19 @@ def test_an_interruption_leaves_an_image_of_what_there_is(renderer: Renderer, sp
     assert np.all(np.isfinite(result.rgb))
     full = renderer.render(64, seed=3)
     assert result.rgb.mean() == pytest.approx(full.rgb.mean(), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("how", "noise"), [({}, 0.01), ({"mode": "reference"}, 0.01), ({"unbiased": True}, 0.1)], ids=["fast", "reference", "unbiased"]
+)
+def test_a_number_of_samples_and_the_time_end_at_what_comes_first(how: dict[str, Any], noise: float) -> None:
+    renderer = load(CLOUD, predictor=Smooth(), size=(40, 30), **how)
+    short = renderer.render(4096, seed=3, time_limit=1e-6)
+    assert (short.statistics.mean_spp, short.statistics.complete) == (1, True)
+    alone, timed = renderer.render(24, seed=3), renderer.render(24, seed=3, time_limit=1e9)
+    assert (alone.statistics.spp, timed.statistics.spp, timed.statistics.mean_spp) == (24, 24, 24)
+    # Depths are spread otherwise where the number may be cut, but over as much.
+    assert timed.rgb.mean() == pytest.approx(alone.rgb.mean(), rel=noise)
 
 
 def test_an_interruption_between_passes_keeps_them(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:

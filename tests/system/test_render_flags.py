@@ -6,6 +6,7 @@ is found too late. Expected behaviour: as said, for each flag that the parser kn
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -15,9 +16,11 @@ import numpy as np
 import pytest
 from deepclouds_runtime import _job
 from deepclouds_runtime._command import _parser
+from deepclouds_runtime.renderer import Renderer
 from numpy.typing import NDArray
 
 from deepclouds.cli import main
+from deepclouds.errors import InputError
 from deepclouds.exr import read_exr, write_exr
 from deepclouds.volume import Volume, write_vol
 
@@ -166,6 +169,7 @@ def test_good_values_show(folder: Path) -> None:
         (["--png", "{folder}/nowhere/x.png"], "the folder {folder}/nowhere does not exist; create it first"),
         (["--output", "{folder}/x.png"], "x.png: the name must end in .exr"),
         (["--model", "{folder}"], "no such model file"),
+        (["--mode", "reference", "--error", "0.1"], "--error 0.1: the reference mode takes the samples of --spp"),
     ],
 )
 def test_bad_values_end_in_code_2(folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
@@ -184,6 +188,72 @@ def test_bad_values_end_in_code_2(folder: Path, capsys: pytest.CaptureFixture[st
 def test_an_empty_volume_has_no_optical_depth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", str(folder / "empty.vol"), "-o", str(folder / "image.exr"), "--optical-depth", "5"]) == 2
     assert "empty.vol: the volume is empty, so no extinction gives it an optical depth of 5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "taken", "locked", "said"),
+    [
+        ([], "image.exr", False, "image.exr is a folder; name a file"),
+        (["--png"], "image.png", False, "image.png is a folder; name a file"),
+        (["--turntable", "3"], "image.0002.exr", False, "image.0002.exr is a folder; name a file"),
+        (["--turntable", "3", "--png"], "image.0003.png", False, "image.0003.png is a folder; name a file"),
+        ([], None, True, "choose another folder or change its permissions"),
+    ],
+)
+def test_files_that_cannot_be_written_are_refused_before_any_work(
+    flags: list[str],
+    taken: str | None,
+    locked: bool,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def run(*arguments: object) -> int:
+        raise AssertionError("nothing is rendered")
+
+    monkeypatch.setattr(_job, "run", run)
+    if taken is not None:
+        (tmp_path / taken).mkdir()
+    if locked:
+        monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert main(["render", str(CLOUD), "-o", str(tmp_path / "image.exr"), *flags]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+def test_a_full_disk_ends_in_code_2(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / f".image.{os.getpid()}.tmp{suffix}").symlink_to("/dev/full")
+    flags = ["--unbiased", "--size", "16x12", "--spp", "1", "--png", "--quiet"]
+    assert main(["render", str(CLOUD), "-o", str(tmp_path / "image.exr"), *flags]) == 2
+    assert f"image{suffix}: cannot be written (" in capsys.readouterr().err
+    # The image is whole where the preview alone failed.
+    assert sorted(p.name for p in tmp_path.iterdir()) == ([] if suffix == ".exr" else ["image.exr"])
+
+
+@pytest.mark.parametrize(
+    ("flags", "error"),
+    [
+        (["--turntable", "2"], _job.ERROR_OF_FRAMES),
+        (["--turntable", "2", "--error", "0.1", "--time", "3"], 0.1),
+        (["--turntable", "2", "--time", "3"], None),
+        (["--turntable", "2", "--spp", "3"], None),
+        ([], None),
+    ],
+)
+def test_time_or_paths_alone_have_no_error_to_aim_at(
+    flags: list[str], error: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Expected behaviour: frames among others aim at less noise, but all of the time is used, and all of the samples."""
+    asked: list[object] = []
+
+    def render(self: Renderer, *arguments: object, error: float | None = None, **how: object) -> None:
+        asked.append(error)
+        raise InputError("enough")
+
+    monkeypatch.setattr(Renderer, "render", render)
+    assert main(["render", str(CLOUD), "-o", str(tmp_path / "x.exr"), "--unbiased", "--size", "16x12", "--quiet", *flags]) == 2
+    assert asked == [error]
 
 
 @pytest.mark.parametrize(

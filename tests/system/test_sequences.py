@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deepclouds_runtime import predictor
 from deepclouds_runtime.key_frames import fixed_by, with_extinction
 from deepclouds_runtime.loading import load
 from deepclouds_runtime.octree import lattice_around
+from deepclouds_runtime.renderer import Renderer
 from deepclouds_runtime.turntable import Turntable, rotation
 from deepclouds_runtime.volume_scene import VolumeOptions, framed_corners, pivot
 from numpy.typing import NDArray
@@ -24,9 +26,10 @@ from numpy.typing import NDArray
 from deepclouds.cli import main
 from deepclouds.errors import InputError
 from deepclouds.exr import read_exr
-from deepclouds.volume import Volume, read_vol, write_vol
+from deepclouds.volume import Volume, read_vol, write_vdb, write_vol
 from deepclouds.volume.pyramid import mean_extinction
 
+EMPTY = Path(__file__).parents[1] / "unit" / "data" / "empty.vdb"
 SIZE = ["--size", "16x12", "--spp", "2", "--unbiased", "--quiet"]
 
 
@@ -94,6 +97,66 @@ def test_what_is_fixed_is_that_of_the_key_frames(folder: Path) -> None:
     with pytest.raises(InputError, match=r"puff_0001.vol: the frames that fix extinction and camera of the sequence are empty"):
         fixed_by(files[:1], VolumeOptions())
     assert with_extinction(VolumeOptions(optical_depth=10.0), fixed).optical_depth is None
+
+
+def test_frames_without_a_voxel_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nor do they stop the others: they show no cloud."""
+    for frame, radius in ((1, None), (2, 0.5), (3, 0.8), (4, None), (5, None)):
+        file = tmp_path / f"puff_{frame:04d}.vdb"
+        if radius is None:
+            file.write_bytes(EMPTY.read_bytes())
+        else:
+            write_vdb(file, _ball(radius))
+    files = sorted(tmp_path.iterdir())
+    some, whole = fixed_by(files, VolumeOptions()), fixed_by(files[1:3], VolumeOptions())
+    assert (some.extinction, some.unit) == (whole.extinction, whole.unit)
+    np.testing.assert_array_equal(some.corners, whole.corners)
+    with pytest.raises(InputError, match=r"puff_0004.vdb, puff_0005.vdb: the frames that fix extinction .* are empty"):
+        fixed_by(files[3:], VolumeOptions())
+    arguments = ["render", str(tmp_path / "puff_%04d.vdb"), "-o", str(tmp_path / "f.exr"), "--frames", "1-4"]
+    assert main([*arguments, *SIZE]) == 0
+    cover = [read_exr(tmp_path / f"f.000{frame}.exr").channels["volume_opacity"].max() for frame in (1, 2, 3, 4)]
+    assert cover[0] == cover[3] == 0
+    assert min(cover[1:3]) > 0.9
+    # Alone it is still refused.
+    assert main(["render", str(files[0]), "-o", str(tmp_path / "alone.exr"), *SIZE]) == 2
+    assert "is empty: it has no active voxel" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"optical_depth": 10.0, "extinction": 5.0}, "optical_depth and extinction are both given"),
+        ({"optical_depth": -10.0}, "optical_depth = -10.0: give a finite number that is not negative"),
+        ({"extinction": -1.0}, "extinction = -1.0: give a finite number that is not negative"),
+    ],
+)
+def test_what_a_sequence_is_given_is_checked_as_for_one_file(folder: Path, options: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        fixed_by([folder / "puff_0001.vol"], VolumeOptions(**options))
+
+
+def test_every_frame_asks_the_same_networks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[object] = []
+    asked: list[tuple[object, bool]] = []
+
+    class Released(Smooth):
+        def __init__(self, model: object, threads: object) -> None:
+            loaded.append(model)
+
+    monkeypatch.setattr(predictor, "Predictor", Released)
+    whole = Renderer.render
+
+    def render(self: Renderer, *arguments: Any, correct: bool, **how: Any) -> Any:
+        assert correct
+        asked.append((self.predictor, self._quicker is not None))
+        return whole(self, *arguments, **how)
+
+    monkeypatch.setattr(Renderer, "render", render)
+    files = [str(folder / "puff_####.vol"), "-o", str(folder / "f.exr")]
+    assert main(["render", *files, "--size", "16x12", "--spp", "1", "--correct", "--quiet"]) == 0
+    assert asked == [(asked[0][0], True)] * 3
+    assert loaded == [None, predictor.RELEASED[-1]]
 
 
 class Smooth:

@@ -188,6 +188,54 @@ def test_a_disc_in_the_picture_does_not_hide_noise(mi: Any) -> None:
     assert 0.002 < shown.statistics.noise < 0.02
 
 
+def test_a_bright_spot_of_a_map_does_not_hide_noise(mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a disc does not."""
+    monkeypatch.chdir(tmp_path)
+    noise = []
+    for spot in (0.2, 2000.0):
+        sky = np.full((64, 128, 3), 0.2, np.float32)
+        sky[41:44, 116:120] = spot
+        mi.Bitmap(sky).write("map.exr")
+        renderer = Renderer(
+            read_scene(_scene(mi, POINT + '<emitter type="envmap"><string name="filename" value="map.exr"/></emitter>', ""))
+        )
+        images = [renderer.render(error=0.02, seed=seed) for seed in (1, 2)]
+        assert (images[0].channels["background.R"].max() > 500) == (spot > 500)
+        first, second = (image.channels["volume_direct.R"].astype(np.float64) for image in images)
+        noise.append(np.sqrt(np.mean(np.square(first - second)) / 2) / np.mean(first))
+    assert noise[1] < 1.5 * noise[0]
+
+
+@pytest.mark.parametrize("mode", ["fast", "reference"])
+def test_no_disc_is_seen_through_what_is_opaque(mi: Any, mode: str) -> None:
+    """What optical depths leave out beyond their limit would be seen: a sun is a hundred thousand times as bright as a cloud."""
+    volume = Volume.from_box(np.ones((8, 8, 8), np.float32), (-1, -1, -1), (1, 1, 1))
+    sun = VolumeOptions(sky=(0.0,), sun=(180.0, 0.0), sun_diameter=0.53)
+    options = replace(sun, optical_depth=300, albedo=(0.0,), view=(0.0, 0.0), size=(65, 65), max_depth=2, up="y")
+    image = Renderer(volume_scene(volume, options, "block"), mode=mode).render(4).rgb
+    middle = slice(22, 43), slice(22, 43)
+    assert image[middle].max() == 0
+    thin = Renderer(volume_scene(volume, replace(options, optical_depth=5), "block"), mode=mode).render(4).rgb
+    assert thin[middle].max() > 1
+
+
+def test_the_cloud_throws_no_light_to_the_horizon(mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From ten thousand radii away the cosine of the cloud's cone is 1 in single precision."""
+    monkeypatch.chdir(tmp_path)
+    _scene(mi, POINT, FLOOR.format("diffuse").replace('"5"', '"200000"'))
+    file = Path("scene.xml")
+    file.write_text(
+        file.read_text()
+        .replace('"42"/>', '"0.02"/><float name="far_clip" value="1e6"/>')
+        .replace('target="0, -0.4, 0"', 'target="-10000, -0.15, 4.2"')
+        .replace('"max_depth" value="2"', '"max_depth" value="-1"')
+    )
+    surface = Renderer(read_scene(mi.load_file(str(file))), unbiased=True).render(64).channels["surface.R"]
+    lit = 0.5 / math.pi * 3 * 0.8 / math.sqrt(0.25 + 2 * 0.64)
+    assert np.median(surface) == pytest.approx(lit, rel=1e-3)
+    assert surface.max() < 1.001 * lit
+
+
 @pytest.mark.parametrize("limb", [(), ((1.5,), (1.1,), (0.4,))])
 @pytest.mark.parametrize("diameter", [0.53, 60.0])
 def test_a_disc_brings_its_irradiance(mi: Any, diameter: float, limb: tuple[tuple[float, ...], ...]) -> None:

@@ -90,6 +90,15 @@ def test_time_alone_decides_where_no_error_is_given(renderer: Renderer) -> None:
     assert many.statistics.mean_spp >= 2
 
 
+def test_samples_and_error_end_at_what_comes_first(renderer: Renderer) -> None:
+    few = renderer.render(4096, seed=1, error=0.3)
+    assert few.statistics.noise is not None
+    assert few.statistics.noise <= 0.3
+    assert few.statistics.complete
+    assert few.statistics.mean_spp < 1000
+    assert renderer.render(3, seed=1, error=1e-3).statistics.mean_spp == 3
+
+
 def test_the_command_says_what_it_does(cloud: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> None:
     out = cloud.parent / "image.exr"
     caplog.set_level(logging.INFO)

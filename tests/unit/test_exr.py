@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,19 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, image: np.ndarray) -
         fail()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.parametrize(("suffix", "size"), [(".exr", 8), (".exr", 256), (".png", 8)])
+def test_a_full_disk_is_bad_input_and_leaves_the_old_file(tmp_path: Path, suffix: str, size: int) -> None:
+    """Of a small image only the last bytes are written, which OpenEXR itself does not miss."""
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"old")
+    (tmp_path / f".a.{os.getpid()}.tmp{suffix}").symlink_to("/dev/full")
+    rgb = np.random.default_rng(1).random((size, size, 3))
+    with pytest.raises(InputError, match=rf"a\{suffix}: cannot be written \(.+\); make room on the disk"):
+        write_exr(path, layers(rgb)) if suffix == ".exr" else write_png(path, rgb)
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 def test_preview(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from deepclouds_runtime.all_round import DIRECTIONS, fit, harmonics, spread
 from deepclouds_runtime.lights import median_cut
 from deepclouds_runtime.march import depths, gathered
-from deepclouds_runtime.octree import Lattice, Octree, lattice_around, root_nodes
+from deepclouds_runtime.octree import Lattice, Octree, lattice_around, lattice_of, root_nodes
 from numpy.typing import NDArray
 
 from deepclouds.backend import backend, vectors_of
@@ -162,6 +162,21 @@ def test_corners_of_the_root_cells_are_counted() -> None:
     Octree(lattice, kept, points, np.ones(len(points)), 1.0, 10**6, 0)
     assert 0 < root_nodes(lattice, points, 1) == asked[0] < 0.8 * np.prod(lattice.size + 1)
     assert root_nodes(lattice, points, 10**9) == np.prod(lattice.size + 1)
+
+
+@pytest.mark.parametrize("anchored", [False, True])
+@pytest.mark.parametrize("most", [1, 64, 200])
+def test_cells_grow_until_their_corners_are_few_or_they_cannot(anchored: bool, most: int) -> None:
+    """With an anchor, up to five cells a side are the fewest that there can be."""
+    random = np.random.default_rng(5)
+    for _ in range(20):
+        lengths, anchor = random.uniform(0.5, 2, 3), random.uniform(-5, 5, 3) if anchored else None
+        points = random.uniform(0, 1, (500, 3)) * lengths
+        how = lengths, np.zeros(3), np.eye(3)
+        lattice = lattice_of(*how, 0.02, anchor, points, most)
+        assert root_nodes(lattice, points, most) <= most or lattice.spacing == lattice_around(*how, 2 * lattice.spacing, anchor).spacing
+        smallest = lattice_around(*how, 0.02, anchor)
+        assert lattice_of(*how, 0.02, anchor, points, 10**9).spacing == smallest.spacing
 
 
 def test_a_change_between_the_nodes_arrives_there() -> None:

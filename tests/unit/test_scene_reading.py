@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from deepclouds_runtime.loading import load as load_renderer
 from deepclouds_runtime.placement import box_transform, cube_transform, locate, orientations
 from deepclouds_runtime.scene import CloudScene, check_depth, read_scene
 from deepclouds_runtime.sunsky import split
@@ -357,6 +358,33 @@ def test_cameras_that_are_refused(mi: Any, folder: Path, camera: str, said: str)
     scene = load(mi, folder, cloud(), camera)
     with pytest.raises(InputError, match=said):
         read_scene(scene)
+
+
+HOMOGENEOUS = '<medium type="homogeneous" name="interior"><float name="scale" value="{scale}"/>{values}</medium>'
+
+
+@pytest.mark.parametrize(
+    ("medium", "said"),
+    [
+        (
+            MEDIUM.format(grid=GRID.format(turn=PLACE, extra=""), albedo=ALBEDO, phase=HG).replace('"5"', '"-5"'),
+            "scale = -5: give a finite",
+        ),
+        (
+            HOMOGENEOUS.format(scale=-2, values='<float name="sigma_t" value="-3"/>'),
+            "scale = -2: give a finite number that is not negative",
+        ),
+        (HOMOGENEOUS.format(scale=1, values='<float name="sigma_t" value="-3"/>'), "sigma_t = -3: give a finite number"),
+        (HOMOGENEOUS.format(scale=1, values='<float name="sigma_t" value="nan"/>'), "sigma_t = nan: give a finite number"),
+        (HOMOGENEOUS.format(scale=1, values='<float name="albedo" value="1.5"/>'), "albedo = 1.5: give values in 0 to 1"),
+        (HOMOGENEOUS.format(scale=1, values='<float name="albedo" value="-0.5"/>'), "albedo = -0.5: give values in 0 to 1"),
+    ],
+)
+def test_what_is_out_of_range_is_refused_with_its_file(mi: Any, folder: Path, medium: str, said: str) -> None:
+    shape = CLOUD.format(shape="cube", turn="", bsdf=NULL, medium=medium)
+    load(mi, folder, shape + SUN)
+    with pytest.raises(InputError, match=rf"scene\.xml: the medium's {said}"):
+        load_renderer(folder / "scene.xml", unbiased=True)
 
 
 def test_path_lengths() -> None:
