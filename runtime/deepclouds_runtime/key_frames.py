@@ -33,12 +33,15 @@ class Fixed:
         (3,) world point that the cells of filter and octree are aligned to: the first key frame's centre of mass.
     corners
         (n, 3) world points that the camera frames: those of all key frames.
+    longest
+        longest side of the boxes of all key frames, world units: with it goes whether the network knows clouds of this size.
     """
 
     extinction: float
     unit: float
     origin: NDArray[np.float64]
     corners: NDArray[np.float64]
+    longest: float
 
 
 def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = None, clamp: bool = False) -> Fixed:
@@ -59,7 +62,7 @@ def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = N
         for options out of range, when all key frames are empty, and for what the readers refuse.
     """
     check(options)
-    scales, masses, means, corners = [], [], [], []
+    scales, masses, means, corners, longest = [], [], [], [], 0.0
     origin = None
     for file in files:
         volume = read_frame(file, grid, clamp)
@@ -72,12 +75,13 @@ def fixed_by(files: Sequence[Path], options: VolumeOptions, grid: str | None = N
         masses.append(float(volume.stored.sum(dtype=np.float64)) * float(np.prod(volume.voxel_size)))
         means.append(mean)
         corners.append(framed_corners(volume))
+        longest = max(longest, float(np.linalg.norm(volume.to_world[:3, :3], axis=0).max()))
     if origin is None:
         names = ", ".join(file.name for file in files)
         raise InputError(f"{names}: the frames that fix extinction and camera of the sequence are empty; leave empty frames out of it")
     scale = min(scales)
     mean = float(np.average(means, weights=masses)) * scale
-    return Fixed(scale, 1 / mean if mean > 0 else 1.0, origin, np.concatenate(corners))
+    return Fixed(scale, 1 / mean if mean > 0 else 1.0, origin, np.concatenate(corners), longest)
 
 
 def read_frame(file: Path, grid: str | None = None, clamp: bool = False) -> Volume | None:

@@ -114,7 +114,7 @@ def load(
             # Frames of a sequence share it.
             quick = cache(partial(Predictor, RELEASED[-1], threads))
     if fixed is not None:
-        how = {"unit": fixed.unit, "origin": fixed.origin, **how}
+        how = {"unit": fixed.unit, "origin": fixed.origin, "longest": fixed.longest, **how}
     return Renderer(scene, predictor, quick, load_seconds=time.perf_counter() - started, **how)
 
 

@@ -86,6 +86,9 @@ class Renderer:
         whether the network is asked about media that it was not trained on; by default J then comes from walks.
     unit, origin
         of the descriptor, see `deepclouds.descriptor.Descriptor`: fixed for a sequence of frames; by default those of the cloud.
+    longest
+        in the place of the longest side of the cloud's box, world units, for the choice whether the model knows clouds of this size:
+        fixed for a sequence, too.
     load_seconds
         what loading took before, reported as ``seconds["load"]``.
 
@@ -118,6 +121,7 @@ class Renderer:
         extrapolate: bool = False,
         unit: float | None = None,
         origin: NDArray[np.float64] | None = None,
+        longest: float | None = None,
         load_seconds: float = 0.0,
     ) -> None:
         if mode not in MODES:
@@ -159,7 +163,7 @@ class Renderer:
                 "the albedo varies in space, and the network knows one albedo a query: it is asked with the mean around each point, and "
                 "walks correct that; in an image that is not corrected multiple scattering is path-traced, noisy and slow",
             )
-        if self._network is not None and (unknown := _unknown(self._network, predictor, scene)):
+        if self._network is not None and (unknown := _unknown(self._network, predictor, scene, longest)):
             self._unknown = not extrapolate
             instead = (
                 "extrapolated"
@@ -168,7 +172,7 @@ class Renderer:
                 "each sample, noisy and slow"
             )
             self.notes += (f"the model was not trained for {', '.join(unknown)}: multiple scattering is {instead}",)
-        self.quick = quick
+        self.quick, self._longest = quick, longest
         self.model_hash: str | None = None
         if self._network is not None and not self._unknown:
             self.model_hash = getattr(getattr(predictor, "metadata", None), "initialisers_sha256", None)
@@ -180,7 +184,7 @@ class Renderer:
         if self.quick is None or self._network is None or self._unknown:
             return None
         predictor = self.quick()
-        return None if _unknown(self._network, predictor, self.scene) else self._network.asking(predictor)
+        return None if _unknown(self._network, predictor, self.scene, self._longest) else self._network.asking(predictor)
 
     @property
     def unit(self) -> float | None:
@@ -438,11 +442,12 @@ def _say_nothing_to_audit() -> None:
     _LOG.info("nothing to audit: multiple scattering is path-traced, and no network is asked")
 
 
-def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene) -> list[str]:
-    """What of the scene's medium the model was not trained on, in words."""
+def _unknown(network: NetworkScattering, predictor: Predicts | None, scene: CloudScene, longest: float | None) -> list[str]:
+    """What of the scene's medium the model was not trained on, in words; `longest` stands for the longest side of its box."""
     outside = getattr(predictor, "outside", None)
     if outside is None or network.descriptor.empty:
         return []
-    longest = float(np.linalg.norm(scene.volume.to_world[:3, :3], axis=0).max())
+    if longest is None:
+        longest = float(np.linalg.norm(scene.volume.to_world[:3, :3], axis=0).max())
     found: list[str] = outside(scene.phase, scene.albedo, longest / network.descriptor.unit)
     return found

@@ -20,7 +20,7 @@ from deepclouds_runtime.loading import load
 from deepclouds_runtime.octree import lattice_around
 from deepclouds_runtime.renderer import Renderer
 from deepclouds_runtime.turntable import Turntable, rotation
-from deepclouds_runtime.volume_scene import VolumeOptions, framed_corners, pivot
+from deepclouds_runtime.volume_scene import VolumeOptions, framed_corners, options_from, pivot
 from numpy.typing import NDArray
 
 from deepclouds.cli import main
@@ -157,6 +157,22 @@ def test_every_frame_asks_the_same_networks(folder: Path, monkeypatch: pytest.Mo
     assert main(["render", *files, "--size", "16x12", "--spp", "1", "--correct", "--quiet"]) == 0
     assert asked == [(asked[0][0], True)] * 3
     assert loaded == [None, predictor.RELEASED[-1]]
+
+
+def test_a_small_puff_is_asked_about_as_the_cloud_that_it_becomes(tmp_path: Path) -> None:
+    """Its box alone is too small for the model; a film that went over from paths to the network would flicker."""
+    for number, (side, density) in enumerate([(0.02, 1.0), (1.0, 1.0), (2.0, 1.0)], 1):
+        write_vol(tmp_path / f"c_{number}.vol", Volume.from_box(np.full((4, 4, 4), density, np.float32), (-side,) * 3, (side,) * 3))
+    files = [tmp_path / f"c_{number}.vol" for number in (1, 2, 3)]
+    options: dict[str, Any] = {"extinction": 10.0, "size": (16, 12)}
+    alone = load(files[0], **options)
+    assert alone.model_hash is None
+    assert "not trained for a cloud of" in alone.notes[-1]
+    fixed = fixed_by(files, options_from(options))
+    for file in files:
+        renderer = load(file, fixed=fixed, **options)
+        assert renderer.model_hash is not None
+        assert not renderer.traces(False)
 
 
 class Smooth:
