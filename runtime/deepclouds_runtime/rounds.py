@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from deepclouds_runtime.frame import Frame
-from deepclouds_runtime.result import RenderResult
+from deepclouds_runtime.result import Image, RenderResult
 
 _LOG = logging.getLogger(__name__)
 # Samples a pixel of which path tracing foretells how many it will take.
@@ -48,7 +48,7 @@ def fixed_rounds(
     an `end` of the time, in seconds of `time.perf_counter`, it takes fewer where that is reached first: rounds are cut so that they should
     end in time, and one sample there is in any case.
     """
-    noise, growth = math.inf, 2.0
+    noise, growth, ending = math.inf, 2.0, 0.0
     may_end = target is not None or not math.isinf(end)
     if watch.partial is None and watch.interrupted is None and not may_end:
         frame.round(0, most, most, watch.progress)
@@ -62,10 +62,10 @@ def fixed_rounds(
         if watch.stops:
             return noise, True
         done = frame.samples
-        more = _in_time(min(math.ceil(done * (growth - 1)), most - done), end, pace)
+        before, ending = _image(frame, ending)
+        more = _in_time(min(math.ceil(done * (growth - 1)), most - done), end - ending, pace)
         if more < 1:
             break
-        before = frame.film.beauty()
         if watch.partial is not None:
             watch.partial(so_far(noise))
         clock = time.perf_counter()
@@ -81,6 +81,13 @@ def fixed_rounds(
             of_error = 0.0 if target is None else (target / max(noise, 1e-9)) ** 2
             watch.progress(min(max(frame.samples / most, of_error, (time.perf_counter() - started) / (end - started)), 1.0))
     return noise, False
+
+
+def _image(frame: Frame, ending: float) -> tuple[Image, float]:
+    """The image so far, and the seconds it took to make, or before: what follows each round, and the last one."""
+    clock = time.perf_counter()
+    image = frame.film.beauty()
+    return image, max(ending, time.perf_counter() - clock)
 
 
 def _in_time(more: int, end: float, pace: float) -> int:
@@ -111,17 +118,17 @@ def rounds_for_error(
     watch, so_far
         who is told, and the image so far from its noise.
     """
-    started, noise, growth = time.perf_counter(), math.inf, 2.0
+    started, noise, growth, ending = time.perf_counter(), math.inf, 2.0, 0.0
     frame.round(0, 1, 0, None)
     pace = max(time.perf_counter() - started, 1e-6)
     while frame.samples < most and (target is None or not noise <= target):
         if watch.stops:
             return noise, True
         done = frame.samples
-        more = _in_time(min(math.ceil(done * (growth - 1)), most - done), end, pace)
+        before, ending = _image(frame, ending)
+        more = _in_time(min(math.ceil(done * (growth - 1)), most - done), end - ending, pace)
         if more < 1:
             break
-        before = frame.film.beauty()
         if watch.partial is not None:
             watch.partial(so_far(noise))
         clock = time.perf_counter()
