@@ -58,17 +58,18 @@ bench: setup-bench
 	$(BIN)/python -m benchmarks.bench $(if $(SCENES),--scenes $(SCENES))
 
 # Makes a data set as one job shared by as many processes as there are processors, each of which does its part of the shards.
-generate = parts=$$(nproc); running=""; \
+# Jobs in the background do not hear Ctrl-C: they are ended with the recipe, and so are the others where one fails.
+generate = parts=$$(nproc); running=""; trap 'kill $$running 2>/dev/null; wait; exit 130' INT TERM; \
   for part in $$(seq 0 $$((parts - 1))); do \
     $(BIN)/deepclouds generate $(1) --shard $$part/$$parts & running="$$running $$!"; \
   done; \
-  for process in $$running; do wait $$process || exit; done
+  for process in $$running; do wait $$process || { kill $$running 2>/dev/null; wait; exit 1; }; done; trap - INT TERM
 
 # Every step goes on where it was interrupted, and is passed over once it is done.
 train-model: setup-train
 	$(call generate,configs/labels.toml -o work/labels)
 	$(call generate,configs/valid_halves_labels.toml -o work/valid_halves)
-	if [ -e work/accurate_run/checkpoint.pt ]; then how=--resume; else how=configs/accurate.toml; fi; \
+	if [ -e work/accurate_run/config.json ]; then how=--resume; else how=configs/accurate.toml; fi; \
 	  $(BIN)/deepclouds train $$how -o work/accurate_run
 	$(BIN)/deepclouds export work/accurate_run -o work/accurate.onnx
 	$(BIN)/deepclouds export work/accurate_run --companion -o work/fast.onnx

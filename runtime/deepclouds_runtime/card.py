@@ -82,6 +82,7 @@ def main(argv: Sequence[str], prog: str = "deepclouds card") -> int:
     if not options.output.parent.is_dir():
         raise InputError(f"{options.output}: the folder {options.output.parent} does not exist; create it first")
     subjects = [describe(model, options.figures) for model in options.models]
+    _refuse_unused(options.figures, [subject.metadata.initialisers_sha256 for subject in subjects])
     with replacing(options.output, ".md") as temporary:
         temporary.write_text(page(subjects, options.output.parent), encoding="utf-8")
     missing = [subject.name for subject in subjects if subject.figures is None]
@@ -111,15 +112,27 @@ def describe(model: str, figures: Sequence[Path]) -> Subject:
 def _figures(paths: Sequence[Path], weights: str) -> dict[str, Any] | None:
     for path in paths:
         for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
-            try:
-                content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-                if content["weights"] == weights:
-                    return content
-            except (OSError, ValueError, KeyError, TypeError) as error:
-                raise InputError(f"{file}: not the figures of a model ({error}); `make accuracy` writes them") from error
-            if not path.is_dir():
-                raise InputError(f"{file}: belongs to the weights {str(content['weights'])[:12]}..., not {weights[:12]}...; measure anew")
+            content = _read(file)
+            if content["weights"] == weights:
+                return content
     return None
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        content["weights"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file}: not the figures of a model ({error}); `make accuracy` writes them") from error
+    return content
+
+
+def _refuse_unused(paths: Sequence[Path], weights: Sequence[str]) -> None:
+    """Refuse, by InputError, files that belong to none of the models; those of a folder may."""
+    for path in paths:
+        if not path.is_dir() and (other := str(_read(path)["weights"])) not in weights:
+            known = ", ".join(f"{own[:12]}..." for own in weights)
+            raise InputError(f"{path}: belongs to the weights {other[:12]}..., not {known}; measure anew")
 
 
 def page(subjects: Sequence[Subject], folder: Path) -> str:

@@ -71,3 +71,12 @@ def test_what_does_not_belong_together_is_refused(model: Path, small_dataset: Pa
         calibrate.main([str(model), *data, "--shards", "0"])
     with pytest.raises(InputError, match="no data set there"):
         calibrate.main([str(model), "--data", str(tmp_path), "--labels", str(small_dataset)])
+
+
+def test_sizes_of_merged_data_are_those_of_all_parts() -> None:
+    """A model without sizes would be asked about clouds of any."""
+    first, second = {"config": {"size": [1, 200]}}, {"config": {"size": [0.5, 40.0]}}
+    assert calibrate.sizes(first) == (1, 200)
+    assert calibrate.sizes({"merged": [first, second]}) == (0.5, 200)
+    assert calibrate.sizes({"merged": [first, {"config": None}]}) is None
+    assert calibrate.sizes({}) is None

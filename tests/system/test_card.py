@@ -68,6 +68,15 @@ def test_figures_of_other_weights_are_refused(figures: Path, tmp_path: Path) -> 
     out = tmp_path / "card.md"
     with pytest.raises(InputError, match="belongs to the weights ffff"):
         main([RELEASED[0], "--figures", str(figures), "-o", str(out)])
+    # Nor do those of another model stand in the way of the model's own.
+    second = tmp_path / "own.json"
+    second.write_text(json.dumps({**content, "weights": Predictor(RELEASED[1]).metadata.initialisers_sha256}))
+    figures.write_text(json.dumps(content))
+    for order in ((figures, second), (second, figures)):
+        named = [word for path in order for word in ("--figures", str(path))]
+        assert main([*RELEASED[:2], *named, "-o", str(out)]) == 0
+        assert "| some labels, all: rRMSE | 12.00 % [11.00, 13.00] | 12.00 % [11.00, 13.00] |" in out.read_text()
+    figures.write_text(json.dumps({**content, "weights": "f" * 64}))
     # Among the files of a folder they are simply not this model's.
     assert main([RELEASED[0], "--figures", str(tmp_path), "-o", str(out)]) == 0
     assert "Not measured" in out.read_text()

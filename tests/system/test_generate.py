@@ -182,6 +182,8 @@ def test_another_configuration_is_not_mixed_in(made: Path, capsys: pytest.Captur
         ("families = ['nimbus']", "nimbus"),
         ("families = ['plume']", "held out"),
         ("resolution = [64, 32]", "increasing"),
+        ("coarse_resolution = [4, 16]", "at least 8"),
+        ("seed = -1", "seed"),
         ("beside = 0.8\nanywhere = 0.4", "shares"),
         ("points = ", "no valid TOML"),
         ("[family_weights]\nplume = -1", "family_weights.plume"),
@@ -366,3 +368,32 @@ def test_labels_from_mitsuba_agree(converged: tuple[Path, list[Shard]], tmp_path
     # Both phase functions on their own, more coarsely: each has half of the points.
     for group in (slice(0, None, 2), slice(1, None, 2)):
         assert mine[group].sum() == pytest.approx(volpath[group].sum(), rel=0.1)
+
+
+@pytest.mark.parametrize("interrupted", [True, False])
+def test_parts_of_a_job_end_together(root: Path, tmp_path: Path, interrupted: bool) -> None:
+    """Rationale: what a shell runs in the background does not hear Ctrl-C, and would go on beside the next attempt.
+    Expected: no part is left after an interruption, or once another one has failed."""
+    (tmp_path / "Makefile").write_text(f"include {root / 'Makefile'}\ntry:\n\t$(call generate,nothing)\n")
+    fails = "" if interrupted else 'case "$4" in 0/*) sleep 1; exit 3;; esac\n'
+    command = tmp_path / "deepclouds"
+    command.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/part$$.pid\n{fails}exec sleep 60\n")
+    command.chmod(0o755)
+    nproc = tmp_path / "nproc"
+    nproc.write_text("#!/bin/sh\necho 2\n")
+    nproc.chmod(0o755)
+    how = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    job = subprocess.Popen(["make", "-s", "try", f"BIN={tmp_path}"], cwd=tmp_path, env=how, start_new_session=True)
+    deadline = time.monotonic() + 30
+    while len(list(tmp_path.glob("*.pid"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    # Once both have begun for good.
+    time.sleep(0.2)
+    if interrupted:
+        os.killpg(job.pid, signal.SIGINT)
+    assert job.wait(timeout=30) != 0
+    parts = [int(path.read_text()) for path in tmp_path.glob("*.pid")]
+    assert len(parts) == 2
+    for part in parts:
+        with pytest.raises(ProcessLookupError):
+            os.kill(part, 0)

@@ -279,3 +279,22 @@ def test_missing_things_are_named(tmp_path: Path, small_dataset: Path) -> None:
     (tmp_path / "damaged" / "checkpoint.pt").write_bytes(b"half a checkpoint")
     with pytest.raises(InputError, match=r"checkpoint\.pt"):
         main(["-o", str(tmp_path / "damaged"), "--resume"], "train")
+
+
+def test_a_line_that_was_cut_short_is_no_metric(tmp_path: Path) -> None:
+    """As a full disk leaves it; a damaged line amid others is said."""
+    run = RunFolder(tmp_path)
+    run.log({"step": 1})
+    run.log({"step": 2})
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(path.read_text() + '{"step": 3, "fig')
+    assert [e["step"] for e in run.metrics()] == [1, 2]
+    run.forget_after(1)
+    assert path.read_text() == '{"step": 1}\n'
+    path.write_text('{"step": 1}\n{"ste\n{"step": 3}\n')
+    with pytest.raises(InputError, match="line 2: no valid JSON"):
+        run.metrics()
+    path.unlink()
+    path.symlink_to("/dev/full")
+    with pytest.raises(InputError, match="cannot be written"):
+        run.log({"step": 1})

@@ -7,7 +7,7 @@ The summaries of training queries give the distance from the training data, held
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,15 +79,21 @@ def main(argv: Sequence[str], prog: str = "deepclouds calibrate") -> int:
         )
     samples = training_summaries(data, options.shards, options.queries, options.backend)
     trust = calibrated(proto.SerializeToString(), samples, options.labels, options.backend)
-    size = data.manifest.get("config", {}).get("size")
-    known = None if size is None else (float(size[0]), float(size[1]))
-    described = metadata.model_copy(update={"trust": trust, "size": known, "data": in_words(data)})
+    described = metadata.model_copy(update={"trust": trust, "size": sizes(data.manifest), "data": in_words(data)})
     target = options.output or options.model
     write_model(proto, described, target)
     quantiles = ", ".join(f"{100 * float(share):g} % {distance:.3g}" for share, distance in trust.quantiles.items())
     print(f"distance of the training data: {quantiles}")
     print(f"{target}: {trust.queries} queries of the training data, {trust.labels} held-out labels")
     return 0
+
+
+def sizes(manifest: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Least and greatest longest side of a data set's clouds, in mean free paths, over all that was merged; None where a part has none."""
+    parts = [part.get("config") or {} for part in manifest.get("merged", [manifest])]
+    if not all("size" in part for part in parts):
+        return None
+    return min(float(part["size"][0]) for part in parts), max(float(part["size"][1]) for part in parts)
 
 
 def read_model(path: Path) -> tuple[Any, ModelMetadata]:

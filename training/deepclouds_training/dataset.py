@@ -80,7 +80,14 @@ def _merge(datasets: list[Dataset], output: Path) -> None:
             if entry.sha256 != same.sha256:
                 raise InputError(f"{d.folder / entry.file} and {other.folder / same.file} differ: one of the two is not of this data set")
     else:
-        sources = [{"config": d.manifest.get("config"), "config_hash": d.manifest.get("config_hash"), "hash": d.hash} for d in datasets]
+        # Of what was merged before, its parts.
+        sources = [
+            part
+            for d in datasets
+            for part in d.manifest.get(
+                "merged", [{"config": d.manifest.get("config"), "config_hash": d.manifest.get("config_hash"), "hash": d.hash}]
+            )
+        ]
         manifest = {"merged": sources, "tracer": tracers[0], "total_shards": len(entries)}
         chosen = {i: (d, replace(entry, index=i, file=shard_file(i))) for i, (d, entry) in enumerate(entries)}
     names = {(d.folder, entry.sha256): entry.file for d, entry in entries}

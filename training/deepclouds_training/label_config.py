@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from deepclouds_training.clouds import FAMILIES, HELD_OUT, TRAINING
+from deepclouds_training.clouds import COARSEST, FAMILIES, HELD_OUT, TRAINING
 from deepclouds_training.config_file import config_hash, read_toml, validated
 from deepclouds_training.labels import GROUP
 
@@ -59,7 +59,7 @@ class GenerateConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    seed: int = 1
+    seed: Annotated[int, Field(ge=0)] = 1
     train_shards: Annotated[int, Field(ge=0)] = 8
     valid_shards: Annotated[int, Field(ge=0)] = 2
     points: Annotated[int, Field(ge=1, le=2**20)] = 8192
@@ -95,8 +95,8 @@ class GenerateConfig(BaseModel):
             raise ValueError(f"families {sorted(both)} are both trained on and held out")
         for name in ("resolution", "coarse_resolution"):
             low, high = getattr(self, name)
-            if not 4 <= low <= high:
-                raise ValueError(f"{name} {(low, high)} must be an increasing pair of at least 4")
+            if not COARSEST <= low <= high:
+                raise ValueError(f"{name} {(low, high)} must be an increasing pair of at least {COARSEST}")
         if not 0 < self.size[0] <= self.size[1]:
             raise ValueError(f"size {self.size} must be an increasing pair above 0")
         if not 0 < self.walks[0] <= self.walks[1] or self.walks[0] % GROUP or self.walks[1] % GROUP:

@@ -122,14 +122,38 @@ class RunFolder:
         return state
 
     def log(self, entry: dict[str, Any]) -> None:
-        """Append one line to the metrics."""
-        with open(self.path / METRICS, "a") as stream:
-            stream.write(json.dumps(entry) + "\n")
+        """Append one line to the metrics.
+
+        Raises
+        ------
+        InputError
+            when it cannot be written, on a full disk for example.
+        """
+        path = self.path / METRICS
+        try:
+            with open(path, "a") as stream:
+                stream.write(json.dumps(entry) + "\n")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror}); make room on the disk, then continue with --resume") from error
 
     def metrics(self) -> list[dict[str, Any]]:
-        """All logged lines."""
+        """All logged lines, but for a last one that was cut short.
+
+        Raises
+        ------
+        InputError
+            when another line is damaged.
+        """
         path = self.path / METRICS
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        lines = path.read_text().splitlines() if path.exists() else []
+        entries = []
+        for number, line in enumerate(lines, 1):
+            try:
+                entries.append(json.loads(line))
+            except ValueError as error:
+                if number < len(lines):
+                    raise InputError(f"{path}, line {number}: no valid JSON ({error}); delete the line") from error
+        return entries
 
     def forget_after(self, step: int) -> None:
         """Drop metrics of steps that the checkpoint does not know: they will be made again."""

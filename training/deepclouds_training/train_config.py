@@ -65,7 +65,7 @@ class TrainConfig(BaseModel):
 
     data: str
     start: str | None = None
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
     steps: int = Field(default=20000, ge=1)
     minutes: float | None = Field(default=None, gt=0)
     batch: int = Field(default=1024, ge=1)

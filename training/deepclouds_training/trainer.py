@@ -265,7 +265,7 @@ class Trainer:
         if not math.isfinite(value):
             raise InputError(
                 f"{self.run.path}: the loss became {value} at step {self.step}; lower learning_rate (now {self.config.learning_rate:g}) "
-                "and resume from the last checkpoint, or start over"
+                "in its config.json and resume from the last checkpoint, or start over"
             )
         learner.update(rate)
         return value

@@ -29,7 +29,7 @@ from deepclouds_training.clouds._parameters import Choice, CloudParameters, Rang
 from deepclouds_training.clouds._raster import Field, rasterise
 
 _ATTEMPTS = 16
-_COARSEST = 8
+COARSEST = 8
 _log = logging.getLogger(__name__)
 
 
@@ -130,8 +130,8 @@ def make_cloud(family: str, seed: int, resolution: int, **parameters: Any) -> Vo
     kind = find_family(family)
     if seed < 0:
         raise InputError(f"seed = {seed} is negative; it takes 0 or more")
-    if resolution < _COARSEST:
-        raise InputError(f"resolution = {resolution} is too coarse for a cloud; it takes {_COARSEST} or more")
+    if resolution < COARSEST:
+        raise InputError(f"resolution = {resolution} is too coarse for a cloud; it takes {COARSEST} or more")
     values = draw_parameters(family, seed, **parameters)
     for attempt in range(_ATTEMPTS):
         volume = rasterise(kind.build(values, named_streams(seed, family, f"attempt {attempt}")), resolution, values.voxel_aspect)
