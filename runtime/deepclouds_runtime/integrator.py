@@ -88,7 +88,9 @@ def _integrator_class(mi: Any) -> Any:
                 extrapolate=self.extrapolate,
                 load_seconds=time.perf_counter() - started,
             )
-            result = renderer.render(spp if spp > 0 else None, int(np.ravel(np.array(seed))[0]), error=self.error)
+            # A number of samples is forced, whatever their noise.
+            how = {"spp": spp} if spp > 0 else {"error": self.error}
+            result = renderer.render(seed=int(np.ravel(np.array(seed))[0]), **how)
             return _develop(mi, read.sensor.film(), result, develop)
 
         def to_string(self) -> str:
