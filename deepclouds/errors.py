@@ -1,4 +1,4 @@
-"""The error every command turns into exit code 2."""
+"""The errors every command turns into exit code 2."""
 
 from __future__ import annotations
 
@@ -8,3 +8,7 @@ class InputError(ValueError):
 
     Libraries raise it; the command line prints it without a traceback and exits with code 2.
     """
+
+
+class EmptyGridError(InputError):
+    """A grid without an active voxel, and so without a box."""

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.errors import InputError
+from deepclouds.errors import EmptyGridError, InputError
 from deepclouds.replacing import replacing
 from deepclouds.volume import _openvdb
 from deepclouds.volume._clean import clean
@@ -223,7 +223,7 @@ def _placed(info: _openvdb.Description, source: str) -> tuple[tuple[int, int, in
     if info["index_to_world"] is None:
         raise InputError(f"{source} has a {info['transform_type']}, which is not affine; resample it to an affine transform first")
     if info["index_box"] is None:
-        raise InputError(f"{source} is empty: it has no active voxel")
+        raise EmptyGridError(f"{source} is empty: it has no active voxel")
     lower, upper = (np.array(corner, np.int64) for corner in info["index_box"])
     nx, ny, nz = (int(n) for n in upper - lower + 1)
     unit_to_index = np.diag([float(nx), ny, nz, 1.0])

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deepclouds.errors import InputError
+from deepclouds.errors import EmptyGridError, InputError
 from deepclouds.volume import Volume, read_volume
 from deepclouds.volume.pyramid import mean_extinction, volume_frame
 from deepclouds_runtime.volume_scene import VolumeOptions, check, extinction, framed_corners
@@ -88,10 +88,8 @@ def read_frame(file: Path, grid: str | None = None, clamp: bool = False) -> Volu
     """The density of one frame of a sequence; None where its grid has no active voxel, and so not even a box."""
     try:
         return read_volume(file, grid, clamp)
-    except InputError as error:
-        if str(error).endswith("is empty: it has no active voxel"):
-            return None
-        raise
+    except EmptyGridError:
+        return None
 
 
 def without_cloud(fixed: Fixed) -> Volume:

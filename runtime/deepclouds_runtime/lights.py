@@ -6,6 +6,7 @@ import heapq
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -255,7 +256,7 @@ class Environment:
             self._bright_parts[times] = self._part(times)
         return self._bright_parts[times]
 
-    @property
+    @cached_property
     def mean(self) -> float:
         """Mean luminance of all directions."""
         rows, columns = self._shape
